@@ -8,12 +8,15 @@ use std::sync::Arc;
 use crate::layout::{ArmIndex, Layout, Task};
 use crate::reward::sparse_reward_within;
 
+use reflection::ReflectionMap;
+
 mod built_in;
 mod check;
 mod derived;
 mod description;
 mod manipulation;
 mod part;
+mod reflection;
 #[cfg(test)]
 mod tests;
 
@@ -21,6 +24,7 @@ pub use check::InvalidTask;
 pub use description::{ArmDescription, Norm, TaskDescription, TaskDifference};
 pub use manipulation::{ArmManipulation, Condition, Manipulation};
 pub use part::Part;
+pub use reflection::Reflection;
 
 /// Largest number of arms of a task. An episode has one bit per arm and step.
 pub const MAX_ARMS: usize = 8;
@@ -40,6 +44,7 @@ struct Checked {
     common_observation: Part,
     common_goal: Part,
     common_achieved_goal: Part,
+    reflection: Option<ReflectionMap>,
     built_in: Option<Layout>,
 }
 
@@ -99,6 +104,7 @@ impl TaskSpec {
             common_observation: Part::new(unowned(description.n_observation, &observations)),
             common_achieved_goal: achieved(&common_goal),
             common_goal: Part::new(common_goal),
+            reflection: ReflectionMap::new(&description),
             built_in,
             description,
         }))

@@ -2,7 +2,8 @@
 
 use tandem_core::TaskSpec;
 use tandem_core::task::{
-    ArmDescription, ArmManipulation, Condition, InvalidTask, Manipulation, Norm, TaskDescription,
+    ArmDescription, ArmManipulation, Condition, InvalidTask, Manipulation, Norm, Reflection,
+    TaskDescription,
 };
 
 use crate::error::DecodeError;
@@ -36,6 +37,7 @@ pub fn encode_task(task: &TaskSpec) -> pb::TaskDescription {
         recombination_gap: task.recombination_gap,
         base: task.base,
         manipulation: encode_manipulation(&task.manipulation),
+        reflection: encode_reflection(&task.reflection),
     }
 }
 
@@ -63,6 +65,7 @@ pub fn decode_task(task: pb::TaskDescription) -> Result<TaskSpec, DecodeError> {
         observation_bound: task.observation_bound,
         goal_bound: task.goal_bound,
         manipulation: task.manipulation.map_or_else(Manipulation::default, decode_manipulation),
+        reflection: task.reflection.map_or_else(Reflection::default, decode_reflection),
     };
     Ok(TaskSpec::new(description)?)
 }
@@ -115,6 +118,28 @@ fn decode_manipulation(manipulation: pb::TaskManipulation) -> Manipulation {
         one_arm_task: manipulation.one_arm_task,
         success_steps: to_usize(manipulation.success_steps).max(1),
         arms: manipulation.arms.into_iter().map(decode).collect(),
+    }
+}
+
+/// A message without it means none.
+fn encode_reflection(reflection: &Reflection) -> Option<pb::Reflection> {
+    let moved = |[to, from]: &[usize; 2]| pb::MovedNumber { to: to_u32(*to), from: to_u32(*from) };
+    (!reflection.is_none()).then(|| pb::Reflection {
+        observation: encode_indices(&reflection.observation),
+        goal: encode_indices(&reflection.goal),
+        action: encode_indices(&reflection.action),
+        moved: reflection.moved.iter().map(moved).collect(),
+    })
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "decoders consume their message")]
+fn decode_reflection(reflection: pb::Reflection) -> Reflection {
+    let moved = |pb::MovedNumber { to, from }: &pb::MovedNumber| [to_usize(*to), to_usize(*from)];
+    Reflection {
+        observation: decode_indices(&reflection.observation),
+        goal: decode_indices(&reflection.goal),
+        action: decode_indices(&reflection.action),
+        moved: reflection.moved.iter().map(moved).collect(),
     }
 }
 
@@ -200,6 +225,12 @@ mod tests {
             observation_bound: vec![2.0, 2.5, 3.0, 3.5],
             goal_bound: vec![1.0, 1.5],
             manipulation: Manipulation::default(),
+            reflection: Reflection {
+                observation: vec![0],
+                goal: vec![0],
+                action: vec![],
+                moved: vec![[0, 1], [1, 0]],
+            },
         })
         .unwrap()
     }

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tandem._task import ArmManipulation as ArmManipulation
     from tandem._task import Condition as Condition
     from tandem._task import Manipulation as Manipulation
+    from tandem._task import Reflection as Reflection
     from tandem._task import Task as Task
     from tandem.clients import Bridge as Bridge
     from tandem.clients import CallError as CallError
@@ -40,7 +41,7 @@ _SERVICES = {
     "_environments": ("EnvironmentServer", "serve"),
     "_grpc": ("ServiceError",),
     "_policies": ("PolicyServer", "serve_policy"),
-    "_task": ("Arm", "ArmManipulation", "Condition", "Manipulation", "Task"),
+    "_task": ("Arm", "ArmManipulation", "Condition", "Manipulation", "Reflection", "Task"),
     "clients": ("Bridge", "CallError", "Learner", "MotionStopped", "Step", "Teacher", "WayPoint"),
 }
 """Names whose modules need gRPC, and are imported when they are first used."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tandem._grpc import ServiceError
-from tandem._task import Arm, Manipulation, Norm, Task, distance
+from tandem._task import Arm, Manipulation, Norm, Reflection, Task, distance
 
 DEFAULT_BOUND = 1000.0
 """The bound of numbers for which the environment's space has none."""
@@ -33,6 +33,7 @@ class TaskOptions:
     recombination_gap: float = 0.0
     base: float = 0.0
     manipulation: Manipulation = Manipulation()
+    reflection: Reflection = Reflection()
     reports_contacts: bool = False
     tolerance: float | None = None
     norm: Norm | None = None
@@ -97,6 +98,7 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         recombination_gap=options.recombination_gap,
         base=options.base,
         manipulation=options.manipulation,
+        reflection=options.reflection,
     )
     _check_arms(task)
     return task, found is None

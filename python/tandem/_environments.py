@@ -20,7 +20,7 @@ from tandem._describe import TaskOptions, describe
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._gym import EnvFn, GymEnvironment, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
-from tandem._task import Arm, Floats, Manipulation, Norm, Task
+from tandem._task import Arm, Floats, Manipulation, Norm, Reflection, Task
 
 LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 """The environment variable with the address on which a worker wants its server to listen."""
@@ -307,6 +307,7 @@ class EnvironmentServer(Server):
         recombination_gap: float | None = None,
         base: float | None = None,
         manipulation: Manipulation | None = None,
+        reflection: Reflection | None = None,
         reports_contacts: bool | None = None,
         tolerance: float | None = None,
         norm: Norm | None = None,
@@ -330,6 +331,7 @@ class EnvironmentServer(Server):
             "recombination_gap": recombination_gap,
             "base": base,
             "manipulation": manipulation,
+            "reflection": reflection,
             "reports_contacts": reports_contacts,
             "tolerance": tolerance,
             "norm": norm,
@@ -378,6 +380,8 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       origin_distance, recombination_gap, base: where parts of two arms from different steps may be recombined, as in
         `tandem.v1.TaskDescription`; for arms with `position`.
       manipulation: what the arms share, and what success needs beyond the distance to the goal (`tandem.Manipulation`).
+      reflection: a mirror symmetry of the world, with which each transition is learned from in two ways
+        (`tandem.Reflection`).
       reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges. One
         arm without `arm_contact` touches no other.
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm

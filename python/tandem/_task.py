@@ -97,6 +97,39 @@ class Manipulation:
 
 
 @dataclasses.dataclass(frozen=True)
+class Reflection:
+    """A mirror symmetry: it turns an arm's part of a valid transition into that of another one.
+
+    With several arms it holds while the arm is far enough from the others to be recombined.
+
+    Places are indices within the vector of one arm: 0 is the arm's first number.
+    """
+
+    observation: Sequence[int] = ()
+    """Places in an observation whose numbers change their sign."""
+    goal: Sequence[int] = ()
+    """Places in a goal whose numbers change their sign."""
+    action: Sequence[int] = ()
+    """Places in an action whose numbers change their sign."""
+    moved: Sequence[tuple[int, int]] = ()
+    """Pairs of places in an observation: the first gets the number of the second."""
+
+    def to_message(self) -> task_pb2.Reflection:
+        """Returns the message `tandem.v1.Reflection`."""
+        message = task_pb2.Reflection(observation=self.observation, goal=self.goal, action=self.action)
+        for to, place in self.moved:
+            # `from` is a keyword.
+            message.moved.add(to=to, **{"from": place})
+        return message
+
+    @classmethod
+    def from_message(cls, message: task_pb2.Reflection) -> Reflection:
+        """Returns what `message` describes."""
+        moved = tuple((pair.to, getattr(pair, "from")) for pair in message.moved)
+        return cls(tuple(message.observation), tuple(message.goal), tuple(message.action), moved)
+
+
+@dataclasses.dataclass(frozen=True)
 class Task:
     """Everything that a learner, a teacher and workers know about a task."""
 
@@ -129,6 +162,8 @@ class Task:
     """The coordinate of each arm's base along that axis, for arms with `lateral`."""
     manipulation: Manipulation = Manipulation()
     """What the arms share, and what success needs beyond the distance to the goal."""
+    reflection: Reflection = Reflection()
+    """A mirror symmetry; none by default."""
 
     @classmethod
     def built_in(cls, name: str) -> Task:
@@ -181,6 +216,8 @@ class Task:
             )
         if self.manipulation != Manipulation():
             message.manipulation.CopyFrom(self.manipulation.to_message())
+        if self.reflection != Reflection():
+            message.reflection.CopyFrom(self.reflection.to_message())
         return message
 
     @classmethod
@@ -208,6 +245,7 @@ class Task:
             recombination_gap=message.recombination_gap,
             base=message.base,
             manipulation=Manipulation.from_message(message.manipulation),
+            reflection=Reflection.from_message(message.reflection),
         )
 
 

@@ -10,7 +10,7 @@ from typing import NoReturn
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
 from tandem._describe import DEFAULT_BOUND
-from tandem._task import Arm, ArmManipulation, Condition, Manipulation
+from tandem._task import Arm, ArmManipulation, Condition, Manipulation, Reflection
 
 
 class _Parser(argparse.ArgumentParser):
@@ -79,6 +79,12 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
         help="object with shared_object, one_arm_task, success_steps and arms, as tandem.Manipulation",
     )
     group.add_argument(
+        "--reflection",
+        type=_reflection,
+        metavar="JSON",
+        help="object with observation, goal, action and moved, as tandem.Reflection",
+    )
+    group.add_argument(
         "--reports-contacts", action="store_true", default=None, help="infos have arm_contact, and maybe table_contact"
     )
 
@@ -102,6 +108,15 @@ def _manipulation(text: str) -> Manipulation:
         return Manipulation(**given, arms=arms)
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected an object as tandem.Manipulation: {error}") from None
+
+
+def _reflection(text: str) -> Reflection:
+    try:
+        given = {name: tuple(places) for name, places in json.loads(text).items()}
+        given["moved"] = tuple((to, place) for to, place in given.pop("moved", ()))
+        return Reflection(**given)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"expected an object as tandem.Reflection: {error}") from None
 
 
 def main() -> int:

@@ -363,6 +363,15 @@ def test_what_arms_share_and_success_needs_is_described() -> None:
     assert tandem.Task.from_message(message).to_message() == message
 
 
+def test_a_reflection_is_described() -> None:
+    reflection = tandem.Reflection(observation=(0, 2), goal=(1,), action=(1,), moved=((2, 3), (3, 2)))
+    with tandem.EnvironmentServer((ID, {"tandem_task": {"reflection": reflection}})) as server:
+        message = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
+    assert (list(message.reflection.observation), list(message.reflection.goal)) == ([0, 2], [1])
+    assert tandem.Task.from_message(message).reflection == reflection
+    assert not tandem.Task.built_in("push").to_message().HasField("reflection")
+
+
 def test_contacts_are_sent_if_the_task_reports_them() -> None:
     requests = [reset([(0, 1), (1, 2)]), *[step(np.zeros((2, 2)))] * 3]
     with tandem.EnvironmentServer((ID, {"contacts": True}), reports_contacts=True) as server:

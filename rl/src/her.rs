@@ -46,6 +46,8 @@ struct Relabelled {
     /// Whether each arm has its desired goal, not one of hindsight.
     keeps_goal: Vec<bool>,
     swapped: bool,
+    /// Whether each arm's part is reflected.
+    reflected: Vec<bool>,
 }
 
 /// Samples batches from a replay buffer.
@@ -71,6 +73,7 @@ impl Sampler {
             rewards: vec![0.0; config.reward.n_heads(&layout)],
             keeps_goal: vec![true; layout.n_arms()],
             swapped: false,
+            reflected: vec![false; layout.n_arms()],
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
@@ -148,9 +151,31 @@ impl Sampler {
         }
         self.sample.swapped =
             bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
+        self.sample_reflections(buffer, rng);
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
             RewardKind::PerArm => self.relabel_arms(buffer, rng),
+        }
+    }
+
+    /// Samples which arms' parts are reflected: none unless the arms are apart, whose parts then have nothing to do with
+    /// each other.
+    fn sample_reflections(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
+        if self.config.reflection_prob == 0.0 || !self.layout.has_reflection() {
+            return;
+        }
+        for reflected in &mut self.sample.reflected {
+            *reflected = bernoulli(rng, self.config.reflection_prob);
+        }
+        let are_apart = match self.sample.steps[..] {
+            [_] => true,
+            [first, second] => {
+                self.layout.has_recombinable_arms() && is_apart(buffer, [first, second])
+            }
+            _ => false,
+        };
+        if !are_apart {
+            self.sample.reflected.fill(false);
         }
     }
 
@@ -291,6 +316,11 @@ impl Sampler {
         for (to, from) in layout.arms().zip(self.sources()) {
             let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let observation = buffer.observation(episode_idx, step_idx + later);
+            if self.sample.reflected[from.0] {
+                layout.reflect_observation(to, from, observation, &mut self.raw_observation);
+                layout.reflect_goal(to, from, &self.sample.goal, &mut self.raw_goal);
+                continue;
+            }
             let (part, source) = (layout.observation_of(to), layout.observation_of(from));
             part.copy_from(&mut self.raw_observation, source, observation);
             let (part, source) = (layout.goal_of(to), layout.goal_of(from));
@@ -310,7 +340,11 @@ impl Sampler {
         for (to, from) in self.layout.arms().zip(self.sources()) {
             let step @ StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let action = buffer.action(episode_idx, step_idx);
-            self.layout.action_of(to).copy_from(actions, self.layout.action_of(from), action);
+            if self.sample.reflected[from.0] {
+                self.layout.reflect_action(to, from, action, actions);
+            } else {
+                self.layout.action_of(to).copy_from(actions, self.layout.action_of(from), action);
+            }
             let is_advised = buffer.advised_arms(episode_idx, step_idx) >> from.0 & 1 == 1;
             let foresight = self.config.contact_foresight_steps;
             let is_cloned = is_advised && !has_contact_within(buffer, step, foresight);

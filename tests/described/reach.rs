@@ -5,7 +5,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use tandem_core::rng::{Stream as RandomStream, episode_rng, uniform};
-use tandem_core::task::{ArmDescription, Manipulation, Norm};
+use tandem_core::task::{ArmDescription, Manipulation, Norm, Reflection};
 use tandem_core::work::EpisodeStart;
 use tandem_core::{TaskDescription, TaskSpec};
 use tandem_proto::environment::{
@@ -52,6 +52,7 @@ pub(crate) fn two_arms() -> TaskSpec {
         observation_bound: vec![3.0; 4],
         goal_bound: vec![1.0; 4],
         manipulation: Manipulation::default(),
+        reflection: Reflection::default(),
         arms: vec![arm(0), arm(1)],
     };
     TaskSpec::new(description).expect("consistent")

@@ -2,7 +2,9 @@
 
 use std::ops::Range;
 
-use super::{ArmDescription, ArmManipulation, Condition, Manipulation, Norm, TaskDescription};
+use super::{
+    ArmDescription, ArmManipulation, Condition, Manipulation, Norm, Reflection, TaskDescription,
+};
 use crate::bounds::GOAL_BOUND_M;
 use crate::layout::{
     ArmIndex, EPISODE_STEPS, GOAL_TOLERANCE_M, HAND_POSITION, Layout, OBJECT_POSITION,
@@ -79,6 +81,24 @@ impl Layout {
                 .collect(),
             goal_bound: vec![GOAL_BOUND_M; self.n_goal()],
             manipulation: self.manipulation(),
+            reflection: self.reflection(),
+        }
+    }
+
+    /// The reflection about the vertical plane through the arm's base, y to -y, in the shared world. The gripper of the
+    /// other worlds has two fingers on one side and one on the other.
+    fn reflection(self) -> Reflection {
+        if self.task.world() != World::Shared {
+            return Reflection::default();
+        }
+        // Of each finger, opening and rate. The first two places show the same finger.
+        let fingers = [9, 25].into_iter();
+        Reflection {
+            // Positions of hand and object and the distance between them; quaternion; velocities.
+            observation: vec![1, 4, 7, 12, 14, 17, 19, 21, 23],
+            goal: vec![1],
+            action: vec![1],
+            moved: fingers.flat_map(|at| [[at, at + 2], [at + 1, at + 2], [at + 2, at]]).collect(),
         }
     }
 

@@ -59,6 +59,7 @@ pub(super) fn check(task: &TaskDescription) -> Result<(), InvalidTask> {
     check_arms(task)?;
     check_recombination(task)?;
     check_manipulation(task)?;
+    check_reflection(task)?;
     check_reserved_name(task)
 }
 
@@ -121,9 +122,7 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
         InvalidTask::unless(is_valid, field, "a finite number, 0 or more", value)?;
     }
     InvalidTask::unless(task.base.is_finite(), "base", "a finite number", task.base)?;
-    let of_arms = |n: fn(&super::ArmDescription) -> usize| task.arms.iter().map(n).sum::<usize>();
-    let has_common = of_arms(|arm| arm.observation.len()) < task.n_observation
-        || of_arms(|arm| arm.goal.len()) < task.n_goal;
+    let has_common = has_common_numbers(task);
     for (arm_idx, arm) in task.arms.iter().enumerate() {
         let achieves_own =
             arm.goal.iter().all(|idx| arm.observation.contains(&task.achieved_goal[*idx]));
@@ -141,6 +140,12 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
         InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].lateral"), expected, got)?;
     }
     Ok(())
+}
+
+fn has_common_numbers(task: &TaskDescription) -> bool {
+    let of_arms = |n: fn(&super::ArmDescription) -> usize| task.arms.iter().map(n).sum::<usize>();
+    of_arms(|arm| arm.observation.len()) < task.n_observation
+        || of_arms(|arm| arm.goal.len()) < task.n_goal
 }
 
 fn check_manipulation(task: &TaskDescription) -> Result<(), InvalidTask> {
@@ -172,6 +177,33 @@ fn check_manipulation(task: &TaskDescription) -> Result<(), InvalidTask> {
         for condition in own.all_conditions() {
             check_condition(&field, condition, &arm.observation)?;
         }
+    }
+    Ok(())
+}
+
+/// Every number belongs to an arm, whose part has the places, and no place is named twice.
+fn check_reflection(task: &TaskDescription) -> Result<(), InvalidTask> {
+    let reflection = &task.reflection;
+    if reflection.is_none() {
+        return Ok(());
+    }
+    let has_common = has_common_numbers(task);
+    let expected = "none, or observations and goals in which every number belongs to an arm";
+    InvalidTask::unless(!has_common, "reflection", expected, "numbers that belong to no arm")?;
+    let arm = &task.arms[0];
+    let (to, from): (Vec<usize>, Vec<usize>) =
+        reflection.moved.iter().map(|[to, from]| (*to, *from)).unzip();
+    check_indices("reflection.moved", &from, arm.observation.len())?;
+    for (field, places, n) in [
+        ("reflection.observation", &reflection.observation, arm.observation.len()),
+        ("reflection.goal", &reflection.goal, arm.goal.len()),
+        ("reflection.action", &reflection.action, arm.action.len()),
+        ("reflection.moved", &to, arm.observation.len()),
+    ] {
+        check_indices(field, places, n)?;
+        let twice = (1..places.len()).find(|at| places[..*at].contains(&places[*at]));
+        let got = twice.map_or(0, |at| places[at]);
+        InvalidTask::unless(twice.is_none(), field, "each place once", got)?;
     }
     Ok(())
 }

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::Manipulation;
+use super::{Manipulation, Reflection};
 use crate::text::shortened;
 
 /// Longest text of a value in a message.
@@ -60,6 +60,9 @@ pub struct TaskDescription {
     /// What the arms share, when they hold objects, and what success needs beyond the distance to the goal.
     #[serde(default, skip_serializing_if = "Manipulation::is_default")]
     pub manipulation: Manipulation,
+    /// A mirror symmetry of the world, if it has one.
+    #[serde(default, skip_serializing_if = "Reflection::is_none")]
+    pub reflection: Reflection,
 }
 
 /// The indices of one arm in the vectors of its task. The parts of all arms have the same lengths.
@@ -186,7 +189,7 @@ impl TaskDescription {
         }
         compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
         compare!(reports_contacts, origin_distance, recombination_gap, base);
-        compare!(observation_bound, goal_bound, manipulation);
+        compare!(observation_bound, goal_bound, manipulation, reflection);
         None
     }
 }

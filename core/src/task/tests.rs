@@ -29,6 +29,7 @@ fn interleaved() -> TaskDescription {
         observation_bound: vec![2.0; 4],
         goal_bound: vec![1.0; 2],
         manipulation: Manipulation::default(),
+        reflection: Reflection::default(),
     }
 }
 
@@ -112,6 +113,59 @@ fn each_arm_is_an_instance_of_the_one_arm_task() {
     assert_eq!(three.achieved_goal_of(ArmIndex(1)).as_range(), Some(2..3));
     assert_eq!(three.single_arm(), Some(one.clone()));
     assert_eq!(one.concatenated(9).unwrap_err().field, "number of arms");
+}
+
+#[test]
+fn a_reflection_acts_on_the_part_of_one_arm_and_is_its_own_inverse() {
+    let mut description = interleaved();
+    description.reflection = Reflection {
+        observation: vec![0],
+        goal: vec![0],
+        action: vec![],
+        moved: vec![[0, 1], [1, 0]],
+    };
+    let task = TaskSpec::new(description).unwrap();
+    let (first, second) = (ArmIndex(0), ArmIndex(1));
+    let mut observation = [0.0; 4];
+    task.reflect_observation(first, second, &[1.0, 2.0, 3.0, 4.0], &mut observation);
+    assert_eq!(observation, [-4.0, 0.0, 2.0, 0.0], "2 and 4 are the second arm's");
+    let (mut goal, mut action) = ([9.0; 2], [9.0; 2]);
+    task.reflect_goal(second, second, &[0.5, 0.6], &mut goal);
+    task.reflect_action(first, second, &[0.7, 0.8], &mut action);
+    assert_eq!((goal, action), ([-0.5, 9.0], [9.0, 0.7]), "goals and actions in reverse order");
+
+    let shared = TaskSpec::built_in(Task::SharedPickAndPlace, 1);
+    let original: Vec<f32> = (1..29).map(|number| number as f32).collect();
+    let reflect = |observation: &[f32]| {
+        let mut reflected = vec![0.0; 28];
+        shared.reflect_observation(first, first, observation, &mut reflected);
+        reflected
+    };
+    let once = reflect(&original);
+    assert_eq!(once[..3], [1.0, -2.0, 3.0]);
+    assert_eq!(once[9..12], [12.0, 12.0, 10.0], "two places show the first finger");
+    assert_eq!(once[12..16], [-13.0, 14.0, -15.0, 16.0], "the rotation about y keeps its sense");
+    let twice = reflect(&once);
+    let same = |idx: &usize| ![10, 26].contains(idx);
+    assert!((0..28).filter(same).all(|idx| twice[idx] == original[idx]), "{twice:?}");
+    assert!(!TaskSpec::built_in(Task::PickAndPlace, 1).has_reflection());
+}
+
+#[test]
+fn a_reflection_names_places_of_an_arm_once() {
+    let check = |change: fn(&mut Reflection), message: &str| {
+        let mut description = interleaved();
+        change(&mut description.reflection);
+        assert_eq!(TaskSpec::new(description).unwrap_err().to_string(), message);
+    };
+    check(|it| it.goal = vec![1], "reflection.goal[0]: expected 0 to 0, got 1");
+    check(|it| it.moved = vec![[0, 2]], "reflection.moved[0]: expected 0 to 1, got 2");
+    check(|it| it.action = vec![0, 0], "reflection.action: expected each place once, got 0");
+    let expected = "reflection: expected none, or observations and goals in which every number belongs to an arm, got \
+                    numbers that belong to no arm";
+    let reflection = Reflection { action: vec![0], ..Reflection::default() };
+    let carried = TaskDescription { reflection, ..carried() };
+    assert_eq!(TaskSpec::new(carried).unwrap_err().to_string(), expected);
 }
 
 #[test]

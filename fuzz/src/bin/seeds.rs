@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
-use tandem_core::task::{ArmDescription, Manipulation, Norm};
+use tandem_core::task::{ArmDescription, Manipulation, Norm, Reflection};
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
@@ -230,6 +230,7 @@ fn write_tasks(to: &Path) -> Result<(), AnyError> {
         observation_bound: vec![2.0; 5],
         goal_bound: vec![1.0; 3],
         manipulation: Manipulation::default(),
+        reflection: Reflection::default(),
     };
     let tasks = [
         ("push", TaskSpec::built_in(Task::Push, 2)),

@@ -17,7 +17,7 @@ NORM_EUCLIDEAN: Norm
 NORM_MAXIMUM: Norm
 
 class TaskDescription(_message.Message):
-    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base", "manipulation")
+    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base", "manipulation", "reflection")
     NAME_FIELD_NUMBER: _ClassVar[int]
     N_OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     N_GOAL_FIELD_NUMBER: _ClassVar[int]
@@ -35,6 +35,7 @@ class TaskDescription(_message.Message):
     RECOMBINATION_GAP_FIELD_NUMBER: _ClassVar[int]
     BASE_FIELD_NUMBER: _ClassVar[int]
     MANIPULATION_FIELD_NUMBER: _ClassVar[int]
+    REFLECTION_FIELD_NUMBER: _ClassVar[int]
     name: str
     n_observation: int
     n_goal: int
@@ -52,7 +53,27 @@ class TaskDescription(_message.Message):
     recombination_gap: float
     base: float
     manipulation: TaskManipulation
-    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ...) -> None: ...
+    reflection: Reflection
+    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ..., reflection: _Optional[_Union[Reflection, _Mapping]] = ...) -> None: ...
+
+class Reflection(_message.Message):
+    __slots__ = ("observation", "goal", "action", "moved")
+    OBSERVATION_FIELD_NUMBER: _ClassVar[int]
+    GOAL_FIELD_NUMBER: _ClassVar[int]
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    MOVED_FIELD_NUMBER: _ClassVar[int]
+    observation: _containers.RepeatedScalarFieldContainer[int]
+    goal: _containers.RepeatedScalarFieldContainer[int]
+    action: _containers.RepeatedScalarFieldContainer[int]
+    moved: _containers.RepeatedCompositeFieldContainer[MovedNumber]
+    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., moved: _Optional[_Iterable[_Union[MovedNumber, _Mapping]]] = ...) -> None: ...
+
+class MovedNumber(_message.Message):
+    __slots__ = ("to",)
+    TO_FIELD_NUMBER: _ClassVar[int]
+    FROM_FIELD_NUMBER: _ClassVar[int]
+    to: int
+    def __init__(self, to: _Optional[int] = ..., **kwargs) -> None: ...
 
 class TaskManipulation(_message.Message):
     __slots__ = ("shared_object", "one_arm_task", "success_steps", "arms")

@@ -48,6 +48,11 @@ pub struct ReplayConfig {
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
     /// interchangeable.
     pub arm_swap_prob: f32,
+    /// Probability that an arm's part of a transition is reflected, in [0, 1] (invariant transform experience replay, Lin
+    /// et al. 2020). It takes effect in tasks that describe a reflection only, as those of the shared world do, and while
+    /// arms are far enough apart to be recombined.
+    #[serde(default)]
+    pub reflection_prob: f32,
     /// The reward that the critic learns.
     pub reward: RewardKind,
     /// Whether the goals in the normaliser's statistics get one hindsight step for all arms, as goals in batches do
@@ -92,6 +97,7 @@ impl ReplayConfig {
             ("replay.displaced_fraction", self.displaced_fraction),
             ("replay.coda_fraction", self.coda_fraction),
             ("replay.arm_swap_prob", self.arm_swap_prob),
+            ("replay.reflection_prob", self.reflection_prob),
         ];
         for (key, value) in fractions {
             let is_fraction = (0.0..=1.0).contains(&value);

@@ -18,6 +18,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
         displaced_fraction: 0.5,
         coda_fraction: 0.0,
         arm_swap_prob: 0.5,
+        reflection_prob: 0.0,
         reward,
         joint_goal_statistics: false,
         goal_tolerance_m: 0.05,
@@ -138,6 +139,79 @@ fn swapped_rows_exchange_all_data_of_the_arms() {
         );
     }
     assert!((10..54).contains(&n_swapped));
+}
+
+/// For 64 seeds, a row of a batch from an episode of the shared world, and which arms are reflected in it.
+fn reflected_rows(
+    n_arms: usize,
+    reflection_prob: f32,
+    change: impl Fn(&mut Episode),
+) -> Vec<(Vec<bool>, Batch)> {
+    let layout = Layout::new(Task::SharedPickAndPlace, n_arms);
+    let mut episode = drifting_episode(layout, 0, 0.01);
+    for (idx, value) in episode.observations.iter_mut().enumerate() {
+        *value += (idx % layout.n_observation()) as f32 * 1e-4;
+    }
+    change(&mut episode);
+    let mut buffer = ReplayBuffer::new(layout, 1000);
+    buffer.push(&episode);
+    let config = ReplayConfig { reflection_prob, arm_swap_prob: 0.0, ..config(RewardKind::PerArm) };
+    let mut sampler = Sampler::new(&config, layout);
+    let identity = |n: usize| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+    let (observation, goal) = (identity(layout.n_observation()), identity(layout.n_goal()));
+    let statistics = Statistics { observation: &observation, goal: &goal };
+    (0..64)
+        .map(|row| {
+            let mut batch = Batch::new(layout, n_arms, 1);
+            let mut rng = episode_rng(3, row, Stream::Replay);
+            sampler.fill(&buffer, statistics, &mut rng, &mut batch);
+            (sampler.sample.reflected.clone(), batch)
+        })
+        .collect()
+}
+
+/// With every probability above 0, reflections draw the same random numbers, so rows can be compared one by one.
+#[test]
+fn reflected_rows_are_the_mirror_images_of_the_same_rows() {
+    for n_arms in [1, 2] {
+        // Arms that stay behind their bases are apart.
+        let behind = |episode: &mut Episode| {
+            for (idx, value) in episode.observations.iter_mut().enumerate() {
+                let is_x = [0, 3].contains(&(idx % 28));
+                *value -= if is_x { 0.5 } else { 0.0 };
+            }
+        };
+        let spec = TaskSpec::built_in(Task::SharedPickAndPlace, n_arms);
+        let (half, all) =
+            (reflected_rows(n_arms, 0.5, behind), reflected_rows(n_arms, 1.0, behind));
+        let n_reflected =
+            half.iter().flat_map(|(reflected, _)| reflected).filter(|it| **it).count();
+        assert!((n_arms * 16..n_arms * 48).contains(&n_reflected), "{n_reflected} of 64 per arm");
+        let n = spec.n_observation();
+        for ((reflected, half), (_, all)) in half.into_iter().zip(all) {
+            let (mut inputs, mut actions) = (half.inputs.clone(), half.actions.clone());
+            for arm in spec.arms().filter(|arm| !reflected[arm.0]) {
+                spec.reflect_observation(arm, arm, &half.inputs[..n], &mut inputs[..n]);
+                spec.reflect_goal(arm, arm, &half.inputs[n..], &mut inputs[n..]);
+                spec.reflect_action(arm, arm, &half.actions, &mut actions);
+            }
+            assert_eq!((inputs, actions), (all.inputs, all.actions));
+            assert_eq!((half.rewards, half.bc_mask), (all.rewards, all.bc_mask));
+        }
+    }
+}
+
+#[test]
+fn arms_that_are_near_each_other_are_not_reflected() {
+    let none = |rows: Vec<(Vec<bool>, Batch)>| rows.iter().flat_map(|(it, _)| it).all(|it| !it);
+    // Hands and objects 16 cm in front of their origins, which are 24 cm apart.
+    let in_front = |episode: &mut Episode| {
+        for (idx, value) in episode.observations.iter_mut().enumerate() {
+            *value += if [0, 3].contains(&(idx % 28)) { 0.16 } else { 0.0 };
+        }
+    };
+    assert!(none(reflected_rows(2, 1.0, in_front)));
+    assert!(none(reflected_rows(1, 0.0, |_| ())));
 }
 
 /// A batch of 256 rows from `buffer`, its numbers as they are.

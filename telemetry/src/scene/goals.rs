@@ -155,6 +155,7 @@ mod tests {
             goal_bound: vec![1.0; n_goal],
             arms: vec![arm(0), arm(1)],
             manipulation: tandem_core::task::Manipulation::default(),
+            reflection: tandem_core::task::Reflection::default(),
         };
         TaskSpec::new(description).unwrap()
     }

@@ -88,6 +88,7 @@ pub(crate) fn described(n_goal_per_arm: usize) -> TaskSpec {
         goal_bound: vec![1.0; 2 * n_goal_per_arm],
         arms: vec![arm(0), arm(1)],
         manipulation: tandem_core::task::Manipulation::default(),
+        reflection: tandem_core::task::Reflection::default(),
     })
     .expect("a valid task")
 }
