@@ -46,8 +46,7 @@ struct Relabelled {
     /// Whether each arm has its desired goal, not one of hindsight.
     keeps_goal: Vec<bool>,
     swapped: bool,
-    /// Whether each arm's part is reflected.
-    reflected: Vec<bool>,
+    reflected: bool,
 }
 
 /// Samples batches from a replay buffer.
@@ -73,7 +72,7 @@ impl Sampler {
             rewards: vec![0.0; config.reward.n_heads(&layout)],
             keeps_goal: vec![true; layout.n_arms()],
             swapped: false,
-            reflected: vec![false; layout.n_arms()],
+            reflected: false,
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
@@ -151,32 +150,27 @@ impl Sampler {
         }
         self.sample.swapped =
             bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
-        self.sample_reflections(buffer, rng);
+        self.sample_reflection(buffer, rng);
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
             RewardKind::PerArm => self.relabel_arms(buffer, rng),
         }
     }
 
-    /// Samples which arms' parts are reflected: none unless the arms are apart, whose parts then have nothing to do with
-    /// each other.
-    fn sample_reflections(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
+    /// Samples whether the parts of all arms are reflected: not if the arms are near each other. Both keep their distance
+    /// in the mirror, but links that avoid each other have no mirror image.
+    fn sample_reflection(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         if self.config.reflection_prob == 0.0 || !self.layout.has_reflection() {
             return;
         }
-        for reflected in &mut self.sample.reflected {
-            *reflected = bernoulli(rng, self.config.reflection_prob);
-        }
-        let are_apart = match self.sample.steps[..] {
+        let are_independent = || match self.sample.steps[..] {
             [_] => true,
             [first, second] => {
                 self.layout.has_recombinable_arms() && is_apart(buffer, [first, second])
             }
             _ => false,
         };
-        if !are_apart {
-            self.sample.reflected.fill(false);
-        }
+        self.sample.reflected = bernoulli(rng, self.config.reflection_prob) && are_independent();
     }
 
     fn sample_step(&self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) -> StepIndex {
@@ -316,7 +310,7 @@ impl Sampler {
         for (to, from) in layout.arms().zip(self.sources()) {
             let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let observation = buffer.observation(episode_idx, step_idx + later);
-            if self.sample.reflected[from.0] {
+            if self.sample.reflected {
                 layout.reflect_observation(to, from, observation, &mut self.raw_observation);
                 layout.reflect_goal(to, from, &self.sample.goal, &mut self.raw_goal);
                 continue;
@@ -340,7 +334,7 @@ impl Sampler {
         for (to, from) in self.layout.arms().zip(self.sources()) {
             let step @ StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let action = buffer.action(episode_idx, step_idx);
-            if self.sample.reflected[from.0] {
+            if self.sample.reflected {
                 self.layout.reflect_action(to, from, action, actions);
             } else {
                 self.layout.action_of(to).copy_from(actions, self.layout.action_of(from), action);

@@ -48,9 +48,9 @@ pub struct ReplayConfig {
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
     /// interchangeable.
     pub arm_swap_prob: f32,
-    /// Probability that an arm's part of a transition is reflected, in [0, 1] (invariant transform experience replay, Lin
-    /// et al. 2020). It takes effect in tasks that describe a reflection only, as those of the shared world do, and while
-    /// arms are far enough apart to be recombined.
+    /// Probability that a transition is reflected, in [0, 1] (invariant transform experience replay, Lin et al. 2020). It
+    /// takes effect in tasks that describe a reflection only, as those of the shared world do, and while arms are far
+    /// enough apart to be recombined.
     #[serde(default)]
     pub reflection_prob: f32,
     /// The reward that the critic learns.
