@@ -129,6 +129,8 @@ fn encode_reflection(reflection: &Reflection) -> Option<pb::Reflection> {
         goal: encode_indices(&reflection.goal),
         action: encode_indices(&reflection.action),
         moved: reflection.moved.iter().map(moved).collect(),
+        position: encode_indices(&reflection.position),
+        plane: reflection.plane,
     })
 }
 
@@ -140,6 +142,8 @@ fn decode_reflection(reflection: pb::Reflection) -> Reflection {
         goal: decode_indices(&reflection.goal),
         action: decode_indices(&reflection.action),
         moved: reflection.moved.iter().map(moved).collect(),
+        position: decode_indices(&reflection.position),
+        plane: reflection.plane,
     }
 }
 
@@ -230,6 +234,8 @@ mod tests {
                 goal: vec![0],
                 action: vec![],
                 moved: vec![[0, 1], [1, 0]],
+                position: vec![1],
+                plane: 0.5,
             },
         })
         .unwrap()

@@ -107,16 +107,26 @@ class Reflection:
 
     observation: Sequence[int] = ()
     """Places in an observation whose numbers change their sign."""
+    position: Sequence[int] = ()
+    """Places in an observation of coordinates across the plane, which become twice that of the plane minus themselves."""
     goal: Sequence[int] = ()
-    """Places in a goal whose numbers change their sign."""
+    """Places in a goal of such coordinates."""
     action: Sequence[int] = ()
     """Places in an action whose numbers change their sign."""
     moved: Sequence[tuple[int, int]] = ()
     """Pairs of places in an observation: the first gets the number of the second."""
+    plane: float = 0.0
+    """The coordinate of the mirror plane."""
 
     def to_message(self) -> task_pb2.Reflection:
         """Returns the message `tandem.v1.Reflection`."""
-        message = task_pb2.Reflection(observation=self.observation, goal=self.goal, action=self.action)
+        message = task_pb2.Reflection(
+            observation=self.observation,
+            position=self.position,
+            goal=self.goal,
+            action=self.action,
+            plane=self.plane,
+        )
         for to, place in self.moved:
             # `from` is a keyword.
             message.moved.add(to=to, **{"from": place})
@@ -126,7 +136,14 @@ class Reflection:
     def from_message(cls, message: task_pb2.Reflection) -> Reflection:
         """Returns what `message` describes."""
         moved = tuple((pair.to, getattr(pair, "from")) for pair in message.moved)
-        return cls(tuple(message.observation), tuple(message.goal), tuple(message.action), moved)
+        return cls(
+            tuple(message.observation),
+            tuple(message.position),
+            tuple(message.goal),
+            tuple(message.action),
+            moved,
+            message.plane,
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,7 +82,7 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
         "--reflection",
         type=_reflection,
         metavar="JSON",
-        help="object with observation, goal, action and moved, as tandem.Reflection",
+        help="object with observation, position, goal, action, moved and plane, as tandem.Reflection",
     )
     group.add_argument(
         "--reports-contacts", action="store_true", default=None, help="infos have arm_contact, and maybe table_contact"
@@ -112,9 +112,10 @@ def _manipulation(text: str) -> Manipulation:
 
 def _reflection(text: str) -> Reflection:
     try:
-        given = {name: tuple(places) for name, places in json.loads(text).items()}
-        given["moved"] = tuple((to, place) for to, place in given.pop("moved", ()))
-        return Reflection(**given)
+        given = json.loads(text)
+        moved = tuple((to, place) for to, place in given.pop("moved", ()))
+        plane = float(given.pop("plane", 0.0))
+        return Reflection(**{name: tuple(places) for name, places in given.items()}, moved=moved, plane=plane)
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected an object as tandem.Reflection: {error}") from None
 

@@ -94,11 +94,13 @@ impl Layout {
         // Of each finger, opening and rate. The first two places show the same finger.
         let fingers = [9, 25].into_iter();
         Reflection {
-            // Positions of hand and object and the distance between them; quaternion; velocities.
-            observation: vec![1, 4, 7, 12, 14, 17, 19, 21, 23],
+            // The distance between hand and object; the object's quaternion; velocities.
+            observation: vec![7, 12, 14, 17, 19, 21, 23],
+            position: vec![HAND_POSITION.start + 1, OBJECT_POSITION.start + 1],
             goal: vec![1],
             action: vec![1],
             moved: fingers.flat_map(|at| [[at, at + 2], [at + 1, at + 2], [at + 2, at]]).collect(),
+            plane: 0.0,
         }
     }
 

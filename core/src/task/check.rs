@@ -194,8 +194,11 @@ fn check_reflection(task: &TaskDescription) -> Result<(), InvalidTask> {
     let (to, from): (Vec<usize>, Vec<usize>) =
         reflection.moved.iter().map(|[to, from]| (*to, *from)).unzip();
     check_indices("reflection.moved", &from, arm.observation.len())?;
+    let negated = [&reflection.observation[..], &reflection.position].concat();
+    let (plane, is_plane) = (reflection.plane, reflection.plane.is_finite());
+    InvalidTask::unless(is_plane, "reflection.plane", "a finite number", plane)?;
     for (field, places, n) in [
-        ("reflection.observation", &reflection.observation, arm.observation.len()),
+        ("reflection.observation", &negated, arm.observation.len()),
         ("reflection.goal", &reflection.goal, arm.goal.len()),
         ("reflection.action", &reflection.action, arm.action.len()),
         ("reflection.moved", &to, arm.observation.len()),

@@ -10,19 +10,23 @@ use crate::layout::ArmIndex;
 /// recombined. The default is no reflection.
 ///
 /// Places are indices within the vector of one arm: 0 is the arm's first number.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Deserialize, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Reflection {
-    /// Places in an observation whose numbers change their sign: positions and velocities across the plane, rotations
+    /// Places in an observation whose numbers change their sign: distances and velocities across the plane, rotations
     /// about axes within it.
     pub observation: Vec<usize>,
-    /// Places in a goal whose numbers change their sign.
+    /// Places in an observation of coordinates across the plane, which become twice that of the plane minus themselves.
+    pub position: Vec<usize>,
+    /// Places in a goal of such coordinates.
     pub goal: Vec<usize>,
     /// Places in an action whose numbers change their sign.
     pub action: Vec<usize>,
     /// Pairs of places in an observation: the first gets the number of the second, such as a left finger that of the
     /// right one.
     pub moved: Vec<[usize; 2]>,
+    /// Coordinate of the plane.
+    pub plane: f32,
 }
 
 impl Reflection {
@@ -33,8 +37,16 @@ impl Reflection {
     }
 }
 
-/// For each place in a vector of one arm, the place whose number it gets, and that number's factor: 1 or −1.
-type Places = Vec<(usize, f32)>;
+/// The numbers of a vector of one arm, in order, as functions of the numbers before.
+type Places = Vec<Place>;
+
+/// A number that becomes `offset + factor * number`, with the number at place `from`.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    from: usize,
+    factor: f32,
+    offset: f32,
+}
 
 /// What a reflection does to the vectors of an arm.
 #[derive(Debug)]
@@ -48,18 +60,23 @@ impl ReflectionMap {
     /// Creates the map of a checked task; `None` if it has no reflection.
     pub(super) fn new(task: &TaskDescription) -> Option<Self> {
         let (reflection, arm) = (&task.reflection, &task.arms[0]);
-        let places = |n: usize, negated: &[usize]| -> Places {
-            let factor = |place| if negated.contains(&place) { -1.0 } else { 1.0 };
-            (0..n).map(|place| (place, factor(place))).collect()
+        let places = |n: usize, negated: &[usize], positions: &[usize]| -> Places {
+            let place = |from| match (negated.contains(&from), positions.contains(&from)) {
+                (_, true) => Place { from, factor: -1.0, offset: 2.0 * reflection.plane },
+                (true, false) => Place { from, factor: -1.0, offset: 0.0 },
+                (false, false) => Place { from, factor: 1.0, offset: 0.0 },
+            };
+            (0..n).map(place).collect()
         };
-        let mut observation = places(arm.observation.len(), &reflection.observation);
+        let n_observation = arm.observation.len();
+        let mut observation = places(n_observation, &reflection.observation, &reflection.position);
         for [to, from] in &reflection.moved {
-            observation[*to].0 = *from;
+            observation[*to].from = *from;
         }
         (!reflection.is_none()).then(|| Self {
             observation,
-            goal: places(arm.goal.len(), &reflection.goal),
-            action: places(arm.action.len(), &reflection.action),
+            goal: places(arm.goal.len(), &[], &reflection.goal),
+            action: places(arm.action.len(), &reflection.action, &[]),
         })
     }
 }
@@ -111,8 +128,8 @@ impl TaskSpec {
         target: &mut [f32],
     ) {
         let Some(map) = &self.0.reflection else { return to.copy_from(target, from, source) };
-        for (idx, (place, factor)) in to.iter().zip(places(map)) {
-            target[idx] = factor * source[from.index(*place)];
+        for (idx, place) in to.iter().zip(places(map)) {
+            target[idx] = place.offset + place.factor * source[from.index(place.from)];
         }
     }
 }

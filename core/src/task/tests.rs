@@ -120,19 +120,21 @@ fn a_reflection_acts_on_the_part_of_one_arm_and_is_its_own_inverse() {
     let mut description = interleaved();
     description.reflection = Reflection {
         observation: vec![0],
+        position: vec![1],
         goal: vec![0],
         action: vec![],
         moved: vec![[0, 1], [1, 0]],
+        plane: 0.25,
     };
     let task = TaskSpec::new(description).unwrap();
     let (first, second) = (ArmIndex(0), ArmIndex(1));
     let mut observation = [0.0; 4];
     task.reflect_observation(first, second, &[1.0, 2.0, 3.0, 4.0], &mut observation);
-    assert_eq!(observation, [-4.0, 0.0, 2.0, 0.0], "2 and 4 are the second arm's");
+    assert_eq!(observation, [-4.0, 0.0, -1.5, 0.0], "2 and 4 are the second arm's");
     let (mut goal, mut action) = ([9.0; 2], [9.0; 2]);
     task.reflect_goal(second, second, &[0.5, 0.6], &mut goal);
     task.reflect_action(first, second, &[0.7, 0.8], &mut action);
-    assert_eq!((goal, action), ([-0.5, 9.0], [9.0, 0.7]), "goals and actions in reverse order");
+    assert_eq!((goal, action), ([0.0, 9.0], [9.0, 0.7]), "goals and actions in reverse order");
 
     let shared = TaskSpec::built_in(Task::SharedPickAndPlace, 1);
     let original: Vec<f32> = (1..29).map(|number| number as f32).collect();
@@ -160,6 +162,10 @@ fn a_reflection_names_places_of_an_arm_once() {
     };
     check(|it| it.goal = vec![1], "reflection.goal[0]: expected 0 to 0, got 1");
     check(|it| it.moved = vec![[0, 2]], "reflection.moved[0]: expected 0 to 1, got 2");
+    check(|it| (it.observation, it.position) = (vec![1], vec![0, 1]), {
+        "reflection.observation: expected each place once, got 1"
+    });
+    check(|it| it.plane = f32::NAN, "reflection.plane: expected a finite number, got NaN");
     check(|it| it.action = vec![0, 0], "reflection.action: expected each place once, got 0");
     let expected = "reflection: expected none, or observations and goals in which every number belongs to an arm, got \
                     numbers that belong to no arm";
