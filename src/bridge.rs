@@ -54,6 +54,7 @@ pub(crate) fn bridge(args: BridgeArgs) -> Result<(), Failed> {
 }
 
 fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
+    arms::check_address(&args.arms)?;
     let cell = Cell::load(args.arms.cell.as_deref())?;
     cell.require_measured(args.arms.driver, args.accept_defaults)?;
     let own = metrics::of_process("bridge");

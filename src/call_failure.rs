@@ -6,7 +6,7 @@ use tonic::{Code, Status};
 
 use crate::exit::{Exit, Failed};
 
-/// Returns the failure of a call. `start` is the command that starts a service of the called kind.
+/// Returns the failure of a call. `start` is the command that starts a service of the called kind; empty for no advice.
 pub(crate) fn failed(exit: Exit, status: &Status, start: &str) -> Failed {
     let message = status.message();
     match hint(status, start) {
@@ -17,6 +17,9 @@ pub(crate) fn failed(exit: Exit, status: &Status, start: &str) -> Failed {
 
 fn hint(status: &Status, start: &str) -> Option<String> {
     if status.code() == Code::Unavailable && status.message().ends_with(NOTHING_LISTENS) {
+        if start.is_empty() {
+            return None;
+        }
         return Some(format!("start one with `{start}`"));
     }
     let WrongService { name, address } = WrongService::of(status)?;
@@ -35,6 +38,7 @@ mod tests {
     fn a_call_that_nothing_answers_names_the_command_that_starts_the_service() {
         let refused = Status::unavailable(format!("x:1 does not answer: {NOTHING_LISTENS}"));
         assert_eq!(hint(&refused, "tandem y").as_deref(), Some("start one with `tandem y`"));
+        assert_eq!(hint(&refused, ""), None);
         let broken = Status::unavailable("x:1 does not answer: connection reset");
         assert_eq!(hint(&broken, "tandem y"), None);
     }

@@ -205,7 +205,8 @@ fn operators_describe_reset_move_and_stop() {
     let mut bridge = bridge;
     signal(&bridge.process, "-TERM");
     assert_eq!(bridge.process.wait().expect("ends").code(), Some(0));
-    fails_with(75, &bridge.run(&["stop"]), "does not answer");
+    let unconfirmed = "the stop is not confirmed, use the emergency stop: ";
+    fails_with(75, &bridge.run(&["stop"]), unconfirmed);
 }
 
 #[test]
@@ -227,6 +228,14 @@ fn an_impossible_motion_is_refused_and_moves_nothing() {
         json!({"speed": 1.0, "way_points": [arms]}).to_string()
     };
     try_out("{", "does not hold a motion");
+    let elsewhere =
+        json!({"angles_rad": [0, 2, 5, 3], "velocities_radps": [0, 0, 0, 0], "opening": 0.5});
+    let arm = json!([elsewhere, elsewhere]);
+    let joint_motion = json!({"period_s": 0.1, "arms": [arm, arm]});
+    try_out(
+        &json!({"speed": 1.0, "joint_motion": joint_motion}).to_string(),
+        "tandem bridge to-start",
+    );
     try_out(r#"{"speed": 1.0}"#, "either way_points or joint_motion");
     try_out(&at([-0.12, 0.0, 0.02], 0.5), "mm above the table, at least 4.0");
     try_out(&at([-0.12, 0.0, 0.1], 1.5), "arms[0].opening: expected a number in [0, 1], got 1.5");
@@ -310,7 +319,7 @@ fn a_cell_file_describes_the_arms_and_operators_practise_a_stop() {
         (&json!(1), &json!("emergency-stop"))
     );
     assert_eq!(stopped["arms"][1]["emergency_stop"], json!(true));
-    fails_with(75, &bridge.run(&["reset"]), "good states");
+    fails_with(75, &bridge.run(&["reset"]), "arm 1: the emergency stop is pressed");
     let lines = bridge.run(&["status"]);
     assert!(String::from_utf8_lossy(&lines.stdout).contains("drill   emergency-stop, arm 1"));
     assert_eq!(bridge.json(&["inject", "--clear"])["injected"], json!([]));
@@ -320,7 +329,14 @@ fn a_cell_file_describes_the_arms_and_operators_practise_a_stop() {
         &bridge.run(&["inject", "torque", "--arm", "west"]),
         "the arms are left and east",
     );
-    fails_with(65, &bridge.run(&["inject", "torque", "--joint", "9"]), "fault.joint");
+    for (args, expected) in [
+        (["torque", "--joint", "9"], "--joint 9: the arm has joints 1 to 4"),
+        (["torque", "--arm", "2"], "the arms are left and east"),
+        (["contact", "--joint", "2"], "--joint belongs to"),
+        (["late-states", "--arm", "east"], "--arm does not belong to late-states"),
+    ] {
+        fails_with(64, &bridge.run(&[&["inject"], &args[..]].concat()), expected);
+    }
     let log = logs(&logs_at).pop().expect("a log of the stop");
     drop(bridge);
     let bytes = std::fs::read(log).expect("a log");
@@ -344,8 +360,22 @@ fn real_arms_need_measured_times_and_a_cell_is_refused_with_its_key() {
     let guessed = [&real[..], &["--cell", &cell]].concat();
     refused(&guessed, 64, "no lag_s, reaction_s and brake_s of left and right: measure");
     refused(&[&guessed[..], &["--accept-defaults"]].concat(), 75, "not connected");
+    refused(
+        &["to-start", "--yes", real[0], real[1], real[2], real[3]],
+        64,
+        "real arms need a cell",
+    );
+    // An address that cannot be right is no reason to try again.
+    let at = |driver, address| ["--driver", driver, "--arms-at", address, "--accept-defaults"];
+    refused(&at("sim", "tcpip://127.0.0.1:1"), 64, "--arms-at belongs to real arms");
+    refused(&at("quarc", "127.0.0.1"), 64, "quarc expects tcpip://HOST:PORT");
+    refused(&at("quarc", "ws://127.0.0.1:1"), 64, "quarc expects tcpip://HOST:PORT");
+    refused(&at("quarc", "tcpip://127.0.0.1:1?nagle='off'"), 64, "quarc expects tcpip://HOST:PORT");
+    refused(&at("kinova-ros", "ws://"), 64, "kinova-ros expects ws://HOST:PORT");
     std::fs::write(&path, text.replace("yaw_degrees = 0.0", "yaw = 0.0")).expect("writes");
     refused(&["cell", &cell], 65, "unknown field `yaw`");
+    let nowhere = ["--listen", "127.0.0.1:0", "--no-dashboard", "--record", "/proc"];
+    refused(&nowhere, 64, "cannot write to \"/proc\"");
     let close = text.replace("[0.39, 0.0, 0.0]", "[0.1, 0.0, 0.0]");
     std::fs::write(&path, close).expect("writes");
     refused(&["--cell", &cell, "--listen", "127.0.0.1:0"], 65, "simulated arms would start");

@@ -3,7 +3,8 @@
 //! The file is TOML. `cell_file/default.toml` explains every key. Unknown keys are refused, and every number has to be
 //! finite and within its range. Margins may be wider than the defaults, never narrower.
 
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 use tandem_kinematics::model::MICO_4;
 use tandem_kinematics::{ArmModel, PlacedArm, WorkCell};
 
@@ -61,6 +62,7 @@ pub struct Arm {
     /// Kinova's name of the model, such as `m1n4s200`.
     pub model: String,
     /// Origin of the base frame in the world: x, y, z, metres.
+    #[serde(deserialize_with = "exactly")]
     pub base_m: [f64; 3],
     /// Rotation of the base frame about the world's z axis, degrees.
     pub yaw_degrees: f64,
@@ -114,6 +116,7 @@ pub struct Limits {
 #[serde(deny_unknown_fields, default)]
 pub struct Simulated {
     /// Smallest and largest number of periods of 10 ms until a command takes effect.
+    #[serde(deserialize_with = "exactly")]
     pub latency_periods: [u32; 2],
     /// Time constant with which a joint's speed follows its command, seconds.
     pub lag_s: f64,
@@ -319,6 +322,18 @@ impl Default for Simulated {
     fn default() -> Self {
         Self { latency_periods: [1, 2], lag_s: 0.010, brake_s: 0.040 }
     }
+}
+
+/// Deserializes an array of `N` numbers. Unlike the array types of serde, it refuses further ones.
+fn exactly<'de, T: Deserialize<'de>, D: Deserializer<'de>, const N: usize>(
+    deserializer: D,
+) -> Result<[T; N], D::Error> {
+    let numbers = Vec::deserialize(deserializer)?;
+    let wrong = |numbers: Vec<T>| {
+        let expected = format!("{N} numbers");
+        D::Error::invalid_length(numbers.len(), &expected.as_str())
+    };
+    numbers.try_into().map_err(wrong)
 }
 
 fn model(name: &str) -> Option<&'static ArmModel> {

@@ -222,7 +222,10 @@ impl<D: Driver> Executor<D> {
         let got = self.monitor.n_good();
         let stale = self.monitor.stale_s(now_s) > self.settings.state_hold_s;
         let state = self.monitor.state().filter(|_| got >= GOOD_STATES && !stale);
-        let Some(state) = state else { return Err(ResetError::States { got }) };
+        let Some(state) = state else {
+            let reported = self.monitor.reported().filter(|_| !stale);
+            return Err(reported.unwrap_or(ResetError::States { got }));
+        };
         if !self.monitor.at_rest() {
             return Err(ResetError::Moving);
         }

@@ -69,6 +69,30 @@ impl Arms {
     }
 }
 
+/// Checks that the address of the arms fits their driver, before anything is connected.
+pub(super) fn check_address(args: &ArmsArgs) -> Result<(), Failed> {
+    let Some(address) = &args.arms_at else { return Ok(()) };
+    let scheme = match args.driver {
+        DriverName::Sim => {
+            return Err(Failed::usage(
+                "--arms-at belongs to real arms: give --driver quarc or --driver kinova-ros with it",
+            ));
+        }
+        DriverName::Quarc => "tcpip://",
+        DriverName::KinovaRos => "ws://",
+    };
+    let bare = address.strip_prefix(scheme).unwrap_or(address);
+    let parts = bare.strip_suffix('/').unwrap_or(bare).rsplit_once(':');
+    let is_good = parts.is_some_and(|(host, port)| {
+        !host.is_empty() && !host.contains("//") && port.parse::<u16>().is_ok_and(|port| port > 0)
+    });
+    if is_good {
+        return Ok(());
+    }
+    let driver = name(args.driver);
+    Err(Failed::usage(format!("--arms-at {address:?}: {driver} expects {scheme}HOST:PORT")))
+}
+
 /// Connects to the arms. Returns their driver, how to reconnect to real ones, and what injects faults into simulated
 /// ones.
 pub(super) fn connect(

@@ -17,6 +17,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output, signals};
 
 pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
+    arms::check_address(&args.arms)?;
     let Some(path) = args.arms.cell.clone() else {
         return Err(Failed::usage("--cell FILE is missing: write one with `tandem bridge cell`"));
     };

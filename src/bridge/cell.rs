@@ -40,6 +40,17 @@ impl Cell {
         arms.map(|arm| arm.name.as_str()).collect()
     }
 
+    /// Refuses to move real arms whose bases are guesses.
+    pub(super) fn require_places(&self) -> Result<(), Failed> {
+        if !self.name.is_empty() {
+            return Ok(());
+        }
+        Err(Failed::usage(
+            "real arms need a cell file: write one with `tandem bridge cell > cell.toml`, enter where the arms stand, \
+             and give --cell cell.toml",
+        ))
+    }
+
     /// Refuses to move real arms by guesses, unless the operator accepts them.
     pub(super) fn require_measured(
         &self,

@@ -26,6 +26,7 @@ pub(super) fn home(args: HomeArgs) -> Result<(), Failed> {
              its arms itself",
         ));
     }
+    arms::check_address(&args.arms)?;
     let cell = Cell::load(args.arms.cell.as_deref())?;
     let names: Vec<String> = cell.file.arms.iter().map(|arm| arm.name.clone()).collect();
     let chosen = chosen_arms(args.arm.as_deref(), &names)?;
@@ -85,8 +86,10 @@ fn chosen_arms(wanted: Option<&str>, names: &[String]) -> Result<Vec<usize>, Fai
 
 /// Moves the arms slowly to their start posture.
 pub(super) fn to_start(args: ToStartArgs) -> Result<(), Failed> {
+    arms::check_address(&args.arms)?;
     let cell = Cell::load(args.arms.cell.as_deref())?;
     if args.arms.driver != DriverName::Sim {
+        cell.require_places()?;
         let question = "Both arms move slowly to their start posture. Somebody watches them with a hand on the \
                         emergency stop, and nothing stands in their way";
         confirm(args.confirmation.yes, question, "yes")?;

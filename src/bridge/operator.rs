@@ -15,6 +15,8 @@ use crate::{access, call_failure, output, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// Timeout of a stop, after which the operator has to use the emergency stop: as on the operator page.
+const STOP_TIMEOUT: Duration = Duration::from_secs(4);
 
 pub(super) type Client = BridgeClient<AuthChannel>;
 
@@ -35,11 +37,18 @@ pub(super) fn with_client<F: Future<Output = Result<(), Failed>>>(
 pub(super) async fn call_with_timeout<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
 ) -> Result<T, Failed> {
-    match tokio::time::timeout(TIMEOUT, call).await {
-        Ok(Ok(response)) => Ok(response.into_inner()),
-        Ok(Err(status)) => Err(failed(&status)),
+    within(TIMEOUT, call).await?.map_err(|status| failed(&status))
+}
+
+/// Runs a call for at most `timeout`. Returns its response or status.
+async fn within<T>(
+    timeout: Duration,
+    call: impl Future<Output = Result<Response<T>, Status>>,
+) -> Result<Result<T, Status>, Failed> {
+    match tokio::time::timeout(timeout, call).await {
+        Ok(answer) => Ok(answer.map(Response::into_inner)),
         Err(_elapsed) => {
-            let what = anyhow::anyhow!("the bridge did not respond within {TIMEOUT:?}");
+            let what = anyhow::anyhow!("the bridge did not respond within {timeout:?}");
             Err(Failed::new(Exit::TryAgain, what))
         }
     }
@@ -47,13 +56,16 @@ pub(super) async fn call_with_timeout<T>(
 
 /// Converts the status of a failed call.
 pub(super) fn failed(status: &Status) -> Failed {
-    let exit = match status.code() {
+    call_failure::failed(exit(status), status, "tandem bridge --driver sim")
+}
+
+fn exit(status: &Status) -> Exit {
+    match status.code() {
         Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
         Code::InvalidArgument | Code::OutOfRange => Exit::Data,
         Code::Internal => Exit::Bug,
         _ => Exit::TryAgain,
-    };
-    call_failure::failed(exit, status, "tandem bridge --driver sim")
+    }
 }
 
 /// Acquires the lease on the arms and returns its token.
@@ -92,7 +104,12 @@ pub(super) fn describe(args: &OperatorArgs) -> Result<(), Failed> {
 
 pub(super) fn stop(args: &OperatorArgs) -> Result<(), Failed> {
     with_client(&args.connect, async |mut client: Client| {
-        let stopped = call_with_timeout(client.stop(pb::StopRequest {})).await?.stopped;
+        let answer = within(STOP_TIMEOUT, client.stop(pb::StopRequest {})).await;
+        let response = answer.and_then(|answer| {
+            answer.map_err(|status| call_failure::failed(exit(&status), &status, ""))
+        });
+        let not_confirmed = "the stop is not confirmed, use the emergency stop";
+        let stopped = response.map_err(|failed| failed.context(not_confirmed.to_owned()))?.stopped;
         if args.json {
             output::print(json!({"stopped": stopped.as_ref().map(show::stop_json)}))?;
         } else {

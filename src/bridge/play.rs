@@ -23,6 +23,9 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_millis(40);
 const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
 /// Seconds between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
+/// What helps when the arms are not where a motion starts, for example after a joint has drifted.
+const START_HINT: &str = " (without a bridge, `tandem bridge to-start` moves real arms to a start posture; simulated \
+    arms are there after a restart of their bridge)";
 
 pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
     let motion = file::read(&args.file, args.speed)?;
@@ -71,7 +74,8 @@ async fn check(
             if as_json {
                 output::print(json!({"refused": show::refusal_json(&refused)}))?;
             }
-            let what = anyhow::anyhow!("the motion is refused: {}", refused.sentence);
+            let hint = if refused.name == "start" { START_HINT } else { "" };
+            let what = anyhow::anyhow!("the motion is refused: {}{hint}", refused.sentence);
             Err(Failed::new(Exit::Data, what))
         }
         None => Err(Failed::new(Exit::Bug, anyhow::anyhow!("the bridge sent no verdict"))),

@@ -1,7 +1,9 @@
 //! The priority of the thread that moves the arms.
 
+use std::io;
+
 use thread_priority::{
-    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
+    Error, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
 };
 
@@ -31,6 +33,10 @@ fn try_raise() -> Result<(), String> {
     let priority = ThreadPriorityValue::try_from(PRIORITY)?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let priority = ThreadPriority::Crossplatform(priority);
-    set_thread_priority_and_policy(thread_native_id(), priority, policy)
-        .map_err(|error| error.to_string())
+    set_thread_priority_and_policy(thread_native_id(), priority, policy).map_err(
+        |error| match error {
+            Error::OS(code) => io::Error::from_raw_os_error(code).to_string(),
+            error => error.to_string(),
+        },
+    )
 }

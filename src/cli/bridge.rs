@@ -284,12 +284,12 @@ pub(crate) struct InjectArgs {
     /// Clears all injected faults.
     #[arg(long, conflicts_with_all = ["arm", "joint"])]
     pub(crate) clear: bool,
-    /// Arm: its number, counted from 0, or its name.
-    #[arg(long, value_name = "ARM", default_value = "0")]
-    pub(crate) arm: String,
-    /// Joint of blocked-joint, torque and drift, counted from 1.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) joint: u32,
+    /// Arm: its number, counted from 0, or its name [default: 0].
+    #[arg(long, value_name = "ARM")]
+    pub(crate) arm: Option<String>,
+    /// Joint of blocked-joint, torque and drift, counted from 1 [default: 1].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) joint: Option<u32>,
     #[command(flatten)]
     pub(crate) connect: ConnectArgs,
     /// Prints one JSON object.

@@ -53,7 +53,7 @@ impl MotionJournal {
     /// every log.
     ///
     /// # Errors
-    /// If the directory cannot be created or read, or old logs cannot be deleted.
+    /// If the directory cannot be created, read or written to, or old logs cannot be deleted.
     pub fn create(
         directory: &Path,
         budget_bytes: u64,
@@ -61,6 +61,10 @@ impl MotionJournal {
     ) -> Result<Self, Error> {
         tandem_system::atomic_file::create_directory(directory)
             .map_err(Error::io("create", directory))?;
+        // A directory that takes no files is an error now, not with the first motion.
+        let probe = directory.join(format!(".writable-{}", std::process::id()));
+        let written = std::fs::File::create(&probe).and_then(|_| std::fs::remove_file(&probe));
+        written.map_err(Error::io("write to", directory))?;
         let mut budget = LogBudget::new(directory.to_owned(), budget_bytes);
         budget.enforce()?;
         Ok(Self {

@@ -74,9 +74,11 @@ impl Arm {
         let ros =
             [("ros_node", &self.ros_node, "/"), ("ros_joint_prefix", &self.ros_joint_prefix, "")];
         for (name, got, start) in ros {
-            let is_name = |c: char| c.is_ascii_alphanumeric() || "_/".contains(c);
             let Some(got) = got else { continue };
-            if got.is_empty() || !got.starts_with(start) || !got.chars().all(is_name) {
+            let is_name = |part: &str| {
+                !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+            };
+            if !got.strip_prefix(start).is_some_and(|names| names.split('/').all(is_name)) {
                 let expected = match start {
                     "" => "a prefix of letters, digits and _",
                     _ => "a ROS name that begins with /",

@@ -130,6 +130,16 @@ fn a_bad_value_is_refused_with_its_key_and_range() {
     check("yaw_degrees = 0.0", slow, "arms[0].brake_s is 0.26, expected 0.001 to 0.25 s");
     let late = "yaw_degrees = 0.0\nlag_s = 0.05\nreaction_s = 0.03\nbrake_s = 0.05";
     check("yaw_degrees = 0.0", late, "arms[0].lag_s is 0.05, expected 0 to 0.03 s");
+    check(
+        "[-0.39, 0.0, 0.0]",
+        "[-0.39, 0.0, 0.0, 0.0]",
+        "line 18: invalid length 4, expected 3 numbers",
+    );
+    check("[1, 2]", "[1, 2, 3]", "invalid length 3, expected 2 numbers");
+    for node in ["/", "/left/", "//left"] {
+        let with_node = format!("yaw_degrees = 0.0\nros_node = {node:?}");
+        check("yaw_degrees = 0.0", &with_node, "expected a ROS name that begins with /");
+    }
     check("[1, 2]", "[3, 2]", "simulated.latency_periods[1] is 2, expected 3 to 10 periods");
     let one = DEFAULT_TEXT.split("[[arms]]\nname = \"right\"").next().unwrap();
     let error = CellFile::parse(one).unwrap_err().to_string();

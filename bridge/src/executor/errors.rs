@@ -6,6 +6,7 @@ use tandem_kinematics::{Excess, Refusal};
 use crate::executor::checked::CheckError;
 use crate::executor::lease::LeaseError;
 use crate::executor::state::Phase;
+use crate::executor::stop::StopCause;
 
 /// The number of consecutive good states that a reset requires.
 pub(crate) const GOOD_STATES: u32 = 10;
@@ -62,7 +63,7 @@ impl From<CheckError> for StartError {
 }
 
 /// The reason why stopped arms were not reset.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ResetError {
     /// The client does not own the arms.
@@ -71,8 +72,16 @@ pub enum ResetError {
     /// The arms are not stopped.
     #[error("the arms are not stopped but {0:?}")]
     NotStopped(Phase),
+    /// An arm reports a fault, or a torque beyond the limit.
+    #[error("arm {}: {cause}", .arm.0)]
+    Reported {
+        /// The arm.
+        arm: ArmIndex,
+        /// The cause for which the arms would be stopped again.
+        cause: StopCause,
+    },
     /// There have been too few consecutive good states.
-    #[error("{got} good states in a row, at least {GOOD_STATES} are needed")]
+    #[error("{got} good states in a row, at least {GOOD_STATES} are needed: try again")]
     States {
         /// The number of consecutive good states.
         got: u32,

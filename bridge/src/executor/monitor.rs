@@ -4,6 +4,7 @@ use tandem_kinematics::joints::MAX_JOINTS;
 use tandem_kinematics::{ArmModel, Excess, Joints, WorkCell};
 
 use crate::driver::{ArmReading, PairState};
+use crate::executor::errors::ResetError;
 use crate::executor::settings::Settings;
 use crate::executor::stop::{Breach, StopCause};
 
@@ -61,6 +62,12 @@ impl Monitor {
     /// The number of consecutive valid states that arrived in time.
     pub(crate) fn n_good(&self) -> u32 {
         self.n_good
+    }
+
+    /// Returns why the newest state forbids a reset: an arm reports a fault or a torque beyond the limit.
+    pub(crate) fn reported(&self) -> Option<ResetError> {
+        let Breach { arm, cause, .. } = self.check_reports(self.state()?).err()?;
+        Some(ResetError::Reported { arm: arm?, cause })
     }
 
     /// Counts good states from 0 again, because an exchange failed.

@@ -58,7 +58,15 @@ async fn drill(fault: F, moving: bool, name: &str, place: [Option<u32>; 2]) {
     let lasts = !matches!(fault, F::BlockedJoint | F::Drift);
     if lasts {
         let reset = rig.client.reset(pb::ResetRequest { token: token.clone() }).await;
-        assert!(reset.unwrap_err().message().contains("good states"));
+        let expected = match fault {
+            F::EmergencyStop => "arm 1: the emergency stop is pressed",
+            F::DriveFault => "arm 1: a drive reports a fault",
+            F::Contact => "arm 1: a contact is reported",
+            F::Torque => "arm 1: an unexplained torque of ",
+            _ => "good states in a row",
+        };
+        let refused = reset.unwrap_err();
+        assert!(refused.message().contains(expected), "{refused}");
     }
     clear(&mut rig).await;
     rig.reset(&token).await.unwrap();
