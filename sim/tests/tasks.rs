@@ -51,7 +51,7 @@ fn ten_physics_steps_per_control_step_suffice() {
 
 #[test]
 fn a_scripted_arm_solves_every_start_in_the_shared_world() {
-    check_shared_starts_of_one_arm(60);
+    check_shared_starts_of_one_arm(30);
 }
 
 #[test]
@@ -72,7 +72,7 @@ fn check_shared_starts_of_one_arm(n_episodes: u64) {
 
 #[test]
 fn two_scripted_arms_that_take_turns_solve_most_starts_in_the_shared_world() {
-    check_shared_starts_of_two_arms(40);
+    check_shared_starts_of_two_arms(24);
 }
 
 #[test]

@@ -43,13 +43,3 @@ pub use run_view::{
 };
 pub use trial_log::{LogLevel, TrialMetadata, TrialOutcome, TrialRecorder, TrialSnapshot};
 pub use trials::{ToolPathPoint, TrialRow, TrialsLog, read_trials};
-
-/// Tests of the public interface, which name this crate as other crates do.
-#[cfg(test)]
-#[path = "../tests/episode_log.rs"]
-mod episode_log_tests;
-#[cfg(test)]
-#[path = "../tests/trial_log.rs"]
-mod trial_log_tests;
-#[cfg(test)]
-extern crate self as tandem_telemetry;

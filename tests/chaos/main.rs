@@ -56,10 +56,10 @@ fn run_file(scale: &Scale) -> String {
         arms = 2
         seed = 3
         advice = {{ strategy = "eamc:0.1", budget = {budget} }}
-        rounds = {{ slots = 8, rollouts = 2, lag = 1 }}
+        rounds = {{ slots = 8, rollouts = 2, lag = 1, updates_per_env_step = 0.2 }}
         world = {{ substeps = 10 }}
         ddpg = {{ n_hidden = 32, batch_size = 64 }}
-        evaluation = {{ every_env_steps = 4000, episodes = 8, recorded_episodes = 0 }}
+        evaluation = {{ every_env_steps = 4000, episodes = 8, test_episodes = 8, recorded_episodes = 0 }}
         checkpoint = {{ every_rounds = 4, keep = 2 }}
         stop = {{ max_env_steps = {max_env_steps}, max_minutes = 0 }}
         "#

@@ -21,7 +21,7 @@ use tandem_kinematics::Joints;
 
 use crate::drivers::rig::{PERIOD_S, Patient, Rig, sweep};
 
-const SOURCES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/quarc");
+const SOURCES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/bridge/quarc");
 const WARNINGS: [&str; 5] = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"];
 const SANITIZERS: [&str; 3] = [
     "-g",

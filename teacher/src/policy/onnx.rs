@@ -99,7 +99,7 @@ mod tests {
     use crate::policy::{OneArmPolicy, load};
 
     fn policy_file(name: &str) -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../policies").join(name)
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies").join(name)
     }
 
     /// Writes the models of a shipped policy and returns their paths.

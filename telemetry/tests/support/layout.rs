@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::episode_log_tests::synthetic;
 
 fn layout(name: &str) -> Value {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/foxglove").join(name);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/foxglove").join(name);
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
