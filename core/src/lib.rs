@@ -12,7 +12,7 @@
 //! from a [`TaskDescription`], which is plain data.
 //!
 //! ```
-//! use tandem_core::task::{ArmDescription, Manipulation, Norm};
+//! use tandem_core::task::{ArmDescription, Manipulation, Norm, Reflection};
 //! use tandem_core::{ArmIndex, TaskDescription, TaskSpec};
 //!
 //! // A point on a line: its observation is position and speed, its goal a position.
@@ -41,6 +41,7 @@
 //!     goal_bound: vec![2.0],
 //!     arms: vec![arm],
 //!     manipulation: Manipulation::default(),
+//!     reflection: Reflection::default(),
 //! })?;
 //! assert!(task.is_success(&[0.45, 0.0], &[0.5]));
 //! # Ok::<(), tandem_core::task::InvalidTask>(())
