@@ -43,17 +43,6 @@ ENVIRONMENTS = {
     "panda-push": "PandaPush-v3",
     "tandem-push": "tandem/Push-v0",
 }
-# The mirror symmetry of a Fetch robot's observation: across the plane of its base lie y of gripper and object.
-FETCH_REFLECTION = {
-    "plane": 0.7491,
-    "position": [1, 4],
-    # y of the distance and of the velocities, x and z of the object's rotation and angular velocity.
-    "observation": [7, 11, 13, 15, 17, 19, 21],
-    "goal": [1],
-    "action": [1],
-    # Displacements and velocities of the two fingers.
-    "moved": [[9, 10], [10, 9], [23, 24], [24, 23]],
-}
 TWO_FETCH = {"push": "tandem/TwoFetchPush-v0", "pick-and-place": "tandem/TwoFetchPickAndPlace-v0"}
 STRATEGIES = {"none": "none", "mc-q": "mc-q:0.1", "init-teacher": "init:teacher"}
 SAMPLE_S = 1.0
@@ -165,7 +154,7 @@ def tandem_command(piece, run, options):
     if not is_built_in:
         serve = [sys.executable, "-m", "tandem.serve", piece.env]
         if piece.env.startswith("Fetch"):
-            serve += ["--reflection", json.dumps(FETCH_REFLECTION)]
+            serve += ["--reflection", "fetch"]
         if piece.reports_contacts:
             serve.append("--reports-contacts")
         command += ["--env-command", shlex.join(serve)]

@@ -16,6 +16,7 @@ from tandem.vector import TandemVectorEnv
 if TYPE_CHECKING:
     from tandem._environments import EnvironmentServer as EnvironmentServer
     from tandem._environments import serve as serve
+    from tandem._fetch import FETCH_REFLECTION as FETCH_REFLECTION
     from tandem._grpc import ServiceError as ServiceError
     from tandem._policies import PolicyServer as PolicyServer
     from tandem._policies import serve_policy as serve_policy
@@ -39,6 +40,7 @@ register_envs()
 
 _SERVICES = {
     "_environments": ("EnvironmentServer", "serve"),
+    "_fetch": ("FETCH_REFLECTION",),
     "_grpc": ("ServiceError",),
     "_policies": ("PolicyServer", "serve_policy"),
     "_task": ("Arm", "ArmManipulation", "Condition", "Manipulation", "Reflection", "Task"),

@@ -10,6 +10,7 @@ from typing import NoReturn
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
 from tandem._describe import DEFAULT_BOUND
+from tandem._fetch import FETCH_REFLECTION
 from tandem._task import Arm, ArmManipulation, Condition, Manipulation, Reflection
 
 
@@ -81,8 +82,8 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--reflection",
         type=_reflection,
-        metavar="JSON",
-        help="object with observation, position, goal, action, moved and plane, as tandem.Reflection",
+        metavar="fetch|JSON",
+        help="mirror symmetry: that of the Fetch environments, or an object as tandem.Reflection",
     )
     group.add_argument(
         "--reports-contacts", action="store_true", default=None, help="infos have arm_contact, and maybe table_contact"
@@ -111,13 +112,15 @@ def _manipulation(text: str) -> Manipulation:
 
 
 def _reflection(text: str) -> Reflection:
+    if text == "fetch":
+        return FETCH_REFLECTION
     try:
         given = json.loads(text)
         moved = tuple((to, place) for to, place in given.pop("moved", ()))
         plane = float(given.pop("plane", 0.0))
         return Reflection(**{name: tuple(places) for name, places in given.items()}, moved=moved, plane=plane)
     except (AttributeError, TypeError, ValueError) as error:
-        raise argparse.ArgumentTypeError(f"expected an object as tandem.Reflection: {error}") from None
+        raise argparse.ArgumentTypeError(f"expected fetch or an object as tandem.Reflection: {error}") from None
 
 
 def main() -> int:

@@ -133,6 +133,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     @property
     def tandem_task(self) -> dict[str, Any]:
         """Options of `tandem.serve` that describe the arms; the name is that of the task for one arm."""
+        from tandem._fetch import FETCH_REFLECTION
         from tandem._task import Arm
 
         arms = []
@@ -148,6 +149,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
             "interchangeable_arms": True,
             "origin_distance": self._origin_distance,
             "recombination_gap": RECOMBINATION_GAP_M,
+            "reflection": FETCH_REFLECTION,
         }
 
     def reset(

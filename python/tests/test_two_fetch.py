@@ -162,14 +162,43 @@ def test_a_copy_continues_the_episode_with_its_bits(duplicate, rng):
     assert np.array_equal(env.reset()[0]["observation"], other.reset()[0]["observation"])
 
 
+def reflected(observation):
+    """The mirror image of an observation of one arm, shape `[25]`."""
+    mirror, image = tandem.FETCH_REFLECTION, observation.copy()
+    for to, place in mirror.moved:
+        image[to] = observation[place]
+    image[list(mirror.observation)] *= -1
+    image[list(mirror.position)] = 2 * mirror.plane - image[list(mirror.position)]
+    return image
+
+
+@pytest.mark.parametrize("task", ONE_ARM)
+def test_fetch_has_a_mirror_image(task, rng):
+    first, second = (gymnasium.make(ONE_ARM[task]).unwrapped for _ in range(2))
+    differences_m = []
+    for seed in range(10):
+        first.reset(seed=seed), second.reset(seed=seed)
+        cube = first._utils.get_joint_qpos(first.model, first.data, "object0:joint").copy()
+        cube[1] = 2 * tandem.FETCH_REFLECTION.plane - cube[1]
+        second._utils.set_joint_qpos(second.model, second.data, "object0:joint", cube)
+        second._mujoco.mj_forward(second.model, second.data)
+        for _ in range(10):
+            action = towards(first._get_obs()["observation"], rng).astype(np.float32)
+            mirrored = action * np.array([1, -1, 1, 1], np.float32)
+            original, image = (env.step(a)[0]["observation"] for env, a in ((first, action), (second, mirrored)))
+            differences_m.append(np.abs(original[:6] - reflected(image)[:6]).max())
+    # Contacts amplify small differences.
+    assert np.median(differences_m) < 0.003, np.median(differences_m)
+
+
 @pytest.mark.parametrize("task", IDS)
 def test_a_served_arm_is_described_as_the_task_of_its_teacher(task):
     pytest.importorskip("grpc")
-    with tandem.EnvironmentServer(ONE_ARM[task]) as server:
+    with tandem.EnvironmentServer(ONE_ARM[task], reflection=tandem.FETCH_REFLECTION) as server:
         one = server.task
     with tandem.EnvironmentServer(IDS[task]) as server:
         two = server.task
-    same = ("name", "tolerance", "norm", "episode_steps", "reports_contacts")
+    same = ("name", "tolerance", "norm", "episode_steps", "reports_contacts", "reflection")
     assert [getattr(two, name) for name in same] == [getattr(one, name) for name in same]
     for idx, arm in enumerate(two.arms):
         for kind, n in (("observation", one.n_observation), ("goal", one.n_goal), ("action", one.n_action)):
