@@ -42,7 +42,13 @@ async fn drill(fault: F, moving: bool, name: &str, place: [Option<u32>; 2]) {
     assert_eq!(injected, [expected]);
     let stop = match playing {
         Some(mut playing) => playing.stopped().await,
-        None => rig.eventually(|status| status.stopped.is_some()).await.stopped.unwrap(),
+        None => {
+            // The first status may be older than the reset.
+            let has_stopped = |status: &pb::BridgeStatusResponse| {
+                status.stopped.as_ref().is_some_and(|stop| stop.name != "not-reset")
+            };
+            rig.eventually(has_stopped).await.stopped.unwrap()
+        }
     };
     assert_eq!((stop.name.as_str(), [stop.arm, stop.joint]), (name, place), "{}", stop.sentence);
     if fault != F::LateStates {
