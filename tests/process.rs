@@ -86,7 +86,7 @@ fn check_undisturbed_result(ended: &Output, out: &Path) {
     assert_eq!(printed.lines().last(), Some(summary.trim_end()));
 }
 
-/// Returns the page of metrics at `address`; empty while nobody serves it.
+/// Returns the page of metrics at `address`; empty while nothing listens there.
 fn page(address: SocketAddr) -> String {
     let mut text = String::new();
     if let Ok(mut stream) = TcpStream::connect(address) {

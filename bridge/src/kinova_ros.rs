@@ -183,7 +183,7 @@ pub struct KinovaRosDriver {
     number: u64,
     /// Counts the identifiers of calls and goals.
     n_ids: u64,
-    /// True while the connection only listens: a failure stops no arm, which somebody else may be moving.
+    /// True while the connection only listens: a failure stops no arm, since another program may be moving it.
     is_passive: bool,
     /// The error that ended the connection.
     failure: Option<DriverError>,

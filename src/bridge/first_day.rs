@@ -39,7 +39,7 @@ pub(super) fn home(args: HomeArgs) -> Result<(), Failed> {
         chosen.into_iter().try_fold(Vec::new(), |mut homed, arm| {
             let name = &names[arm];
             let question = format!(
-                "{name}: its node moves the arm along a way of its own and opens the gripper; only the emergency stop \
+                "{name}: its node moves the arm along a path of its own and opens the gripper; only the emergency stop \
                  ends it. Nothing is near the arm or in its gripper"
             );
             confirm(args.confirmation.yes, &question, name)?;

@@ -223,7 +223,7 @@ Examples:
       --cell cell.toml
   tandem bridge home --driver kinova-ros --arms-at ws://10.0.0.5:9090 --arm left
 
-Kinova's node moves the arm by itself along a way that nobody checks, opens its gripper completely, and \
+Kinova's node moves the arm by itself along an unchecked path, opens its gripper completely, and \
 delays every stop until the arm is home: only the emergency stop ends it earlier. Nothing may be in the \
 gripper or near the arm. Refused while a bridge moves or holds the arms. docs/drivers.md describes the \
 first day with real arms.")]
@@ -245,7 +245,7 @@ Examples:
       --cell cell.toml
 
 No joint turns faster than 8 degrees per second. All limits except the tilt of the grippers hold, and \
-without a way that keeps them nothing moves. Ctrl-C, the end of the terminal and a lost connection stop \
+if no path keeps them, nothing moves. Ctrl-C, the end of the terminal and a lost connection stop \
 the arms. No bridge may be connected to the arms.")]
 pub(crate) struct ToStartArgs {
     #[command(flatten)]
@@ -257,7 +257,7 @@ pub(crate) struct ToStartArgs {
 /// Options of commands that an operator confirms.
 #[derive(Debug, Args)]
 pub(crate) struct ConfirmationArgs {
-    /// Does not ask whether somebody watches the arms with a hand on the emergency stop.
+    /// Skips the question whether a person watches the arms with a hand on the emergency stop.
     #[arg(long)]
     pub(crate) yes: bool,
     /// Prints one JSON object.

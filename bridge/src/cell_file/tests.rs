@@ -2,7 +2,7 @@ use super::*;
 use crate::Executor;
 use crate::driver::{Command, Driver, DriverError, PairState};
 
-/// A driver that nobody uses.
+/// An unused driver.
 struct Idle;
 
 impl Driver for Idle {

@@ -1,7 +1,7 @@
 //! Homing an arm after power-up, over a connection of its own and without an executor.
 //!
-//! Kinova's node moves the arm to its home position by itself, along a path that nobody checks, and then opens the
-//! gripper completely. Its one thread serves nothing else meanwhile: it reports no states and **delays `in/stop` until
+//! Kinova's node moves the arm to its home position by itself, along an unchecked path, and then opens the gripper
+//! completely. Its one thread serves nothing else meanwhile: it reports no states and **delays `in/stop` until
 //! the arm is home**. Only the emergency stop ends it earlier.
 
 use std::time::Duration;
@@ -11,7 +11,7 @@ use crate::kinova_ros::node::{Control, Service};
 use crate::kinova_ros::{KinovaRosConfig, KinovaRosDriver};
 use crate::service::Clock;
 
-/// Time in which nobody may publish velocities before an arm is homed, seconds. A bridge whose arms are not stopped
+/// Time before homing in which no publisher of velocities may appear, seconds. A bridge whose arms are not stopped
 /// publishes 100 per second.
 const QUIET_S: f64 = 1.0;
 /// Time limit of `in/start`, `in/stop` and of the states after homing, seconds.

@@ -159,7 +159,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_full_queue_delays_nobody_and_counts_what_is_lost() {
+    fn a_full_queue_delays_no_sender_and_counts_what_is_lost() {
         let (observer, mut snapshots) = observe(2);
         for number in 1..=5 {
             observer.publish(&Arc::new(Snapshot {
