@@ -1,13 +1,16 @@
 //! `tandem eval`: evaluates a policy on fixed goals.
 
 mod baselines;
+mod robustness;
 
 use std::path::{Path, PathBuf};
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::text::counted;
 use tandem_core::work::{EpisodeOrder, RunTerms};
-use tandem_core::{AdviceTerms, Episode, Exploration, Layout, TaskSpec, WorldSettings};
+use tandem_core::{
+    AdviceTerms, Episode, EvaluationSummary, Exploration, Layout, TaskSpec, Wilson, WorldSettings,
+};
 use tandem_picture::FilmEpisode;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
@@ -18,6 +21,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::film::PlannedFilm;
 use crate::{film, live, output, policy_file};
 use baselines::Baselines;
+use robustness::Robustness;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     if names_server(&args.environment) {
@@ -27,6 +31,9 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     args.live.live.map_or(Ok(()), live::check_address)?;
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
+    if args.robustness {
+        return Robustness::measure(args, &subject)?.print(args);
+    }
     let result = measure(&subject, args.episodes, args.seed)?;
     let baselines = Baselines::measure(args, &subject)?;
     let terms = terms(&subject);
@@ -136,6 +143,12 @@ fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> R
         .try_for_each(|path| output::print(format_args!("recorded      {path}")))?;
     let film = args.film.film.iter().map(|path| path.display());
     film.into_iter().try_for_each(|path| output::print(format_args!("film          {path}")))
+}
+
+/// Formats a share of the episodes of `summary` with its interval.
+fn share_text(summary: &EvaluationSummary, share: f64) -> String {
+    let Wilson { low, high } = summary.interval_of(share);
+    format!("{share:.3} [{low:.3}, {high:.3}]")
 }
 
 /// Returns the terms of an evaluation, for the metadata of its logs.

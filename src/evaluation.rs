@@ -12,7 +12,9 @@ use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Task
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
-use tandem_worker::{evaluate, evaluate_blind, evaluate_composed};
+use tandem_worker::{
+    Perturbation, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
+};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{clock, output};
@@ -92,7 +94,7 @@ impl EvaluatedPolicy {
     pub(crate) fn play(&self, n_episodes: u64, seed: u64) -> Result<Vec<Episode>, Failed> {
         let actor = self.policy().actor().or_exit(Exit::Data, String::new)?;
         let (layout, world) = (self.layout(), WorldConfig::default());
-        let n_threads = std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN);
+        let n_threads = n_threads();
         let episodes = match self {
             Self::Policy(_) => evaluate(&actor, layout, &world, n_episodes, seed, n_threads),
             Self::Composed(..) => {
@@ -144,6 +146,27 @@ pub(crate) fn measure(
     let episodes = subject.play(n_episodes, seed)?;
     let (task, digest) = (subject.layout().into(), subject.policy().digest());
     Ok(EvaluationResult::of(episodes, task, digest, start.elapsed()))
+}
+
+/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is the
+/// number of episodes, and the seed of their starts and goals.
+pub(crate) fn measure_perturbed(
+    policy: &Policy,
+    layout: Layout,
+    conditions: (&WorldConfig, Perturbation),
+    (n_episodes, seed): (u64, u64),
+) -> Result<EvaluationResult, Failed> {
+    let start = clock::now();
+    let actor = policy.actor().or_exit(Exit::Data, String::new)?;
+    let n_threads = n_threads();
+    let episodes = evaluate_perturbed(&actor, layout, conditions, n_episodes, seed, n_threads)
+        .or_exit(Exit::Bug, String::new)?;
+    Ok(EvaluationResult::of(episodes, layout.into(), policy.digest(), start.elapsed()))
+}
+
+/// Returns the number of threads that play episodes.
+fn n_threads() -> NonZeroUsize {
+    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 impl EvaluationResult {

@@ -74,6 +74,7 @@ fn a_result_that_cannot_be_written_is_reported_in_one_line() {
         &["policy", "show", POLICY, "--json"],
         &["eval", "--policy", POLICY, "--episodes", "1"],
         &["eval", "--policy", POLICY, "--episodes", "1", "--json"],
+        &["eval", "--policy", POLICY, "--episodes", "1", "--robustness"],
         &["replay", &episode],
         &["replay", &episode, "--verify", "--json"],
         &["mcap", "recover", &episode, "--to", &recovered],

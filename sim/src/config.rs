@@ -19,6 +19,8 @@ pub struct WorldConfig {
     pub object_mass_kg: f32,
     /// Largest force of each side of the gripper, newtons, in [0.1, 60].
     pub grip_force_n: f32,
+    /// Coulomb friction coefficient of the table, in [0, 2].
+    pub table_friction: f32,
     /// Friction in the push task. It is lower than the table's, so a hand pushes objects and cannot drag them from
     /// above.
     pub push: Friction,
@@ -28,8 +30,8 @@ pub struct WorldConfig {
     pub carry_bar: Friction,
 }
 
-/// Coulomb friction coefficients, each in [0, 2]. A contact has the larger coefficient of its two surfaces. That of the
-/// table is 0.6, which is therefore a lower bound for a cube that slides on it.
+/// Coulomb friction coefficients, each in [0, 2]. A contact has the larger coefficient of its two surfaces, so that of
+/// the table is a lower bound for a cube that slides on it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Friction {
@@ -47,6 +49,7 @@ impl Default for WorldConfig {
             object_half_size_m: 0.0225,
             object_mass_kg: 0.1,
             grip_force_n: 15.0,
+            table_friction: 0.6,
             push: Friction { pads: 0.3, object: 0.3 },
             pick_and_place: Friction { pads: 0.45, object: 0.45 },
             carry_bar: Friction { pads: 0.8, object: 0.8 },
@@ -75,6 +78,7 @@ impl WorldConfig {
         check("object_half_size_m", self.object_half_size_m.into(), 0.015, 0.045)?;
         check("object_mass_kg", self.object_mass_kg.into(), 0.02, 1.0)?;
         check("grip_force_n", self.grip_force_n.into(), 0.1, 60.0)?;
+        check("table_friction", self.table_friction.into(), 0.0, 2.0)?;
         check("push.pads", self.push.pads.into(), 0.0, 2.0)?;
         check("push.object", self.push.object.into(), 0.0, 2.0)?;
         check("pick_and_place.pads", self.pick_and_place.pads.into(), 0.0, 2.0)?;

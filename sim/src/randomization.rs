@@ -10,8 +10,6 @@ use tandem_core::{ArmIndex, Task};
 use crate::config::{Friction, WorldConfig};
 use crate::frame::MAX_ARMS;
 
-/// Friction of the table without randomization.
-pub(crate) const TABLE_FRICTION: f32 = 0.6;
 /// Edge of the cubes, metres.
 const OBJECT_EDGE_M: [f32; 2] = [0.045, 0.065];
 /// Mass of the cubes, kilograms.
@@ -58,8 +56,8 @@ impl Episode {
         let object_half_m =
             between(config.object_half_size_m, OBJECT_EDGE_M.map(|edge| 0.5 * edge));
         let object_mass_kg = between(config.object_mass_kg, OBJECT_MASS_KG);
-        let table_friction = between(TABLE_FRICTION, TABLE);
-        let factor = between(1.0, SURFACES) * table_friction / TABLE_FRICTION;
+        let table_friction = between(config.table_friction, TABLE);
+        let factor = between(1.0, SURFACES) * table_friction / config.table_friction;
         let friction = Friction { pads: nominal.pads * factor, object: nominal.object * factor };
         let delay_s = between(0.0, DELAY_S);
         Self { object_half_m, object_mass_kg, friction, table_friction, delay_s }
@@ -125,6 +123,6 @@ mod tests {
         assert_eq!(episode.object_half_m, config.object_half_size_m);
         assert_eq!(episode.object_mass_kg, config.object_mass_kg);
         assert_eq!(episode.friction, config.push);
-        assert_eq!((episode.table_friction, episode.delay_s), (TABLE_FRICTION, 0.0));
+        assert_eq!((episode.table_friction, episode.delay_s), (config.table_friction, 0.0));
     }
 }

@@ -12,7 +12,7 @@ use crate::frame::{ArmFrame, MAX_ARMS};
 use crate::link_avoidance::VelocityDamper;
 use crate::parameters::WorldParameters;
 use crate::physics::{Part, Physics, collides, owner};
-use crate::randomization::{Episode, TABLE_FRICTION};
+use crate::randomization::Episode;
 
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
@@ -58,7 +58,7 @@ impl World {
         let mut objects = Vec::with_capacity(layout.n_arms);
         for arm in layout.arms() {
             let frame = ArmFrame::new(arm, layout.n_arms);
-            add_table(&mut physics, arm, frame);
+            add_table(&mut physics, arm, frame, config.table_friction);
             arms.push(Arm::build(&mut physics, arm, frame, layout.task, config));
             if !layout.task.shares_object() {
                 objects.push(add_object(&mut physics, arm, config, friction.object));
@@ -303,11 +303,11 @@ impl World {
 /// rapier solves the contacts of a cube's four corners in an order that depends on the table's axes, which displaces a
 /// resting cube by a micrometre. With a table per arm, the cubes of the two arms are displaced in opposite directions,
 /// which preserves the symmetry of the arms.
-fn add_table(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) {
+fn add_table(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame, friction: f32) {
     let top_at_zero = Vector::new(0.0, 0.0, -TABLE_HALF_M.z);
     let table = ColliderBuilder::cuboid(TABLE_HALF_M.x, TABLE_HALF_M.y, TABLE_HALF_M.z)
         .position(Pose::from_parts(top_at_zero, frame.orientation_in_world()))
-        .friction(TABLE_FRICTION)
+        .friction(friction)
         .friction_combine_rule(CoefficientCombineRule::Min)
         .collision_groups(collides(Part::Table, arm));
     physics.colliders.insert(table);

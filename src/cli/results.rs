@@ -14,6 +14,8 @@ Examples:
   tandem eval --policy FILE --episodes 400 --seed 7 --json
   tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
+  tandem eval --policy policies/student-push.safetensors --robustness
+      # other cubes and friction, noise, delay
   tandem eval --policy FILE --episodes 1 --record episode.mcap
   tandem eval --policy FILE --film arms.gif             # the first episode
   tandem eval --policy FILE --film strip.png --film-outcome failure
@@ -33,6 +35,12 @@ pub(crate) struct EvalArgs {
     /// other.
     #[arg(long, requires = "policy")]
     pub(crate) baselines: bool,
+    /// Evaluates on the same starts and goals under conditions that the policy was not trained for, one at a time: other
+    /// sizes and masses of the cubes, other friction, noise in the positions of the objects, late actions, and bases that
+    /// are not where they are believed to be.
+    #[arg(long, requires = "policy", conflicts_with_all = [
+        "baselines", "record", "record_dir", "film", "live", "env", "env_command"])]
+    pub(crate) robustness: bool,
     /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
     #[arg(long, value_name = "FILE", requires = "baselines")]
     pub(crate) teacher: Option<PathBuf>,

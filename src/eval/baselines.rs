@@ -1,9 +1,10 @@
 //! Baselines of an evaluation: policies that cannot take account of the other arm.
 
 use serde_json::{Value, json};
-use tandem_core::{EvaluationSummary, Wilson};
+use tandem_core::EvaluationSummary;
 use tandem_report::Table;
 
+use super::share_text;
 use crate::cli::EvalArgs;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::Failed;
@@ -102,10 +103,7 @@ const MEASURES: [(&str, Share); 6] = [
 /// Returns the row of one share, with a cell for each policy.
 fn row(label: &str, share: Share, columns: &[(&str, &EvaluationResult)]) -> Vec<String> {
     let cell = |(_, result): &(&str, &EvaluationResult)| {
-        share(&result.summary).map_or_else(String::new, |share| {
-            let Wilson { low, high } = result.summary.interval_of(share);
-            format!("{share:.3} [{low:.3}, {high:.3}]")
-        })
+        share(&result.summary).map_or_else(String::new, |share| share_text(&result.summary, share))
     };
     std::iter::once(label.to_owned()).chain(columns.iter().map(cell)).collect()
 }

@@ -117,7 +117,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 85] = [
+const CASES: [(&str, i32, &str); 88] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -158,6 +158,9 @@ const CASES: [(&str, i32, &str); 85] = [
     ("eval --policy %teacher-push --episodes 0", 64, "episodes"),
     ("eval --policy %teacher-push --episodes 1 --record @empty/x.mcap", 64, "x.mcap"),
     ("eval --policy %teacher-push --episodes 1 --record-dir @empty/x", 64, "empty/x"),
+    ("eval --composed-teachers %teacher-push --robustness", 64, "--policy"),
+    ("eval --policy %teacher-push --robustness --baselines", 64, "--baselines"),
+    ("eval --policy %teacher-push --robustness --film @empty/x.gif", 64, "--film"),
     ("eval --composed-teachers %student-push", 64, "a teacher drives one"),
     ("teacher", 64, "--policy"),
     ("teacher --policy @missing", 65, "missing"),

@@ -11,6 +11,7 @@ use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, Worl
 use tandem_policy::{Actor, BlindActor};
 use tandem_sim::{Env, WorldConfig};
 
+use crate::perturbation::{Perturbation, PerturbedActor};
 use crate::ports::{Act, Environment, NoAdvisor, Simulator};
 use crate::rollout::{RolloutError, play_slot};
 
@@ -53,7 +54,7 @@ impl<A: Act> Act for ComposedTeachers<A> {
 
 /// Plays `n_episodes` episodes, numbered from 0, and returns them by number. `seed` determines their starts and goals.
 ///
-/// Each of `n_threads` threads has an actor and a world of its own. The result does not depend on their number.
+/// Each of `n_threads` threads has a world of its own. The result does not depend on their number.
 ///
 /// # Errors
 /// When the world cannot be built or a step fails.
@@ -65,7 +66,7 @@ pub fn evaluate(
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|| actor.clone(), layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(|_| actor.clone(), layout, world, n_episodes, seed, n_threads)
 }
 
 /// Plays episodes as [`evaluate`], with the one-arm policy `actor` acting for every arm of `layout`.
@@ -80,7 +81,7 @@ pub fn evaluate_composed(
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let composed = || ComposedTeachers::new(actor.clone(), layout);
+    let composed = |_| ComposedTeachers::new(actor.clone(), layout);
     evaluate_simulated(composed, layout, world, n_episodes, seed, n_threads)
 }
 
@@ -96,11 +97,28 @@ pub fn evaluate_blind(
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|| actor.clone(), layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(|_| actor.clone(), layout, world, n_episodes, seed, n_threads)
 }
 
+/// Plays episodes as [`evaluate`], with the errors of a perturbation between the policy and the arms.
+///
+/// # Errors
+/// When the world cannot be built or a step fails.
+pub fn evaluate_perturbed(
+    actor: &Actor,
+    layout: Layout,
+    (world, perturbation): (&WorldConfig, Perturbation),
+    n_episodes: u64,
+    seed: u64,
+    n_threads: NonZeroUsize,
+) -> Result<Vec<Episode>, RolloutError> {
+    let perturbed = |number| PerturbedActor::new(actor.clone(), layout, perturbation, seed, number);
+    evaluate_simulated(perturbed, layout, world, n_episodes, seed, n_threads)
+}
+
+/// Plays every episode with an actor of its own, that of its number.
 fn evaluate_simulated<A: Act>(
-    make_actor: impl Fn() -> A + Sync,
+    make_actor: impl Fn(u64) -> A + Sync,
     layout: Layout,
     world: &WorldConfig,
     n_episodes: u64,
@@ -114,7 +132,7 @@ fn evaluate_simulated<A: Act>(
 
 fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     env: &E,
-    make_actor: impl Fn() -> A + Sync,
+    make_actor: impl Fn(u64) -> A + Sync,
     terms: &RunTerms,
     n_episodes: u64,
     seed: u64,
@@ -123,8 +141,9 @@ fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     let numbers: Vec<u64> = (0..n_episodes).collect();
     let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
     let play = |numbers: &[u64]| {
-        let (mut env, mut actor) = (env.clone(), make_actor());
-        let play_one = |number: &u64| play_alone(&mut env, &mut actor, terms, seed, *number);
+        let mut env = env.clone();
+        let play_one =
+            |number: &u64| play_alone(&mut env, &mut make_actor(*number), terms, seed, *number);
         numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
     };
     let parts: Vec<_> = std::thread::scope(|scope| {
@@ -191,7 +210,7 @@ mod tests {
         let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
         evaluate_in(
             &FakeEnvironment::new(),
-            || FakeActor::Seeker,
+            |_| FakeActor::Seeker,
             &evaluation_terms(LAYOUT),
             n_episodes,
             seed,
@@ -223,7 +242,7 @@ mod tests {
     fn the_number_of_threads_changes_no_simulation() {
         let evaluate_on = |n_threads| {
             let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
-            let (make_actor, world) = (|| FakeActor::Seeker, WorldConfig::default());
+            let (make_actor, world) = (|_| FakeActor::Seeker, WorldConfig::default());
             evaluate_simulated(make_actor, LAYOUT, &world, 3, 5, n_threads).expect("no step fails")
         };
         assert_eq!(evaluate_on(1), evaluate_on(2));

@@ -17,6 +17,7 @@ pub mod explore;
 mod fakes;
 mod learner;
 mod metrics;
+mod perturbation;
 mod player;
 pub mod ports;
 pub mod record;
@@ -34,7 +35,9 @@ pub use config::{
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
 pub use evaluate::{
-    ComposedTeachers, evaluate, evaluate_blind, evaluate_composed, evaluate_served,
+    ComposedTeachers, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
+    evaluate_served,
 };
+pub use perturbation::Perturbation;
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};
