@@ -22,6 +22,7 @@
 //!     action: vec![0],
 //!     position: vec![],
 //!     lateral: vec![],
+//!     hand: vec![],
 //! };
 //! let task = TaskSpec::new(TaskDescription {
 //!     name: "point".to_owned(),
@@ -37,6 +38,7 @@
 //!     origin_distance: 0.0,
 //!     recombination_gap: 0.0,
 //!     base: 0.0,
+//!     contact_distances: Vec::new(),
 //!     observation_bound: vec![2.0, 1.0],
 //!     goal_bound: vec![2.0],
 //!     arms: vec![arm],

@@ -57,6 +57,7 @@ struct ArmParts {
     achieved_goal: Part,
     position: Part,
     lateral: Part,
+    hand: Part,
 }
 
 impl TaskSpec {
@@ -93,6 +94,7 @@ impl TaskSpec {
             achieved_goal: achieved(&arm.goal),
             position: Part::new(arm.position.clone()),
             lateral: Part::new(arm.lateral.clone()),
+            hand: Part::new(arm.hand.clone()),
         };
         let arms: Vec<ArmParts> = description.arms.iter().map(parts).collect();
         let goals: Vec<&[usize]> = description.arms.iter().map(|arm| &arm.goal[..]).collect();
@@ -126,6 +128,12 @@ impl TaskSpec {
     #[must_use]
     pub fn name(&self) -> &str {
         &self.0.description.name
+    }
+
+    /// Returns true if the task says at which distance hands are in contact.
+    #[must_use]
+    pub fn describes_contacts(&self) -> bool {
+        !self.0.description.contact_distances.is_empty()
     }
 
     /// Returns the length of an observation.
@@ -192,6 +200,13 @@ impl TaskSpec {
     #[must_use]
     pub fn lateral_of(&self, arm: ArmIndex) -> &Part {
         &self.0.arms[arm.0].lateral
+    }
+
+    /// Returns the indices, in an observation, of the coordinates of `arm`'s hand, which may be empty: see
+    /// [`ArmDescription::hand`].
+    #[must_use]
+    pub fn hand_of(&self, arm: ArmIndex) -> &Part {
+        &self.0.arms[arm.0].hand
     }
 
     /// Returns the numbers of an observation that belong to no arm.

@@ -36,6 +36,7 @@ pub fn encode_task(task: &TaskSpec) -> pb::TaskDescription {
         origin_distance: task.origin_distance,
         recombination_gap: task.recombination_gap,
         base: task.base,
+        contact_distances: task.contact_distances.clone(),
         manipulation: encode_manipulation(&task.manipulation),
         reflection: encode_reflection(&task.reflection),
     }
@@ -62,6 +63,7 @@ pub fn decode_task(task: pb::TaskDescription) -> Result<TaskSpec, DecodeError> {
         origin_distance: task.origin_distance,
         recombination_gap: task.recombination_gap,
         base: task.base,
+        contact_distances: task.contact_distances,
         observation_bound: task.observation_bound,
         goal_bound: task.goal_bound,
         manipulation: task.manipulation.map_or_else(Manipulation::default, decode_manipulation),
@@ -77,6 +79,7 @@ fn encode_arm(arm: &ArmDescription) -> pb::TaskArm {
         action: encode_indices(&arm.action),
         position: encode_indices(&arm.position),
         lateral: encode_indices(&arm.lateral),
+        hand: encode_indices(&arm.hand),
     }
 }
 
@@ -88,6 +91,7 @@ fn decode_arm(arm: pb::TaskArm) -> ArmDescription {
         action: decode_indices(&arm.action),
         position: decode_indices(&arm.position),
         lateral: decode_indices(&arm.lateral),
+        hand: decode_indices(&arm.hand),
     }
 }
 
@@ -210,6 +214,7 @@ mod tests {
             action: vec![1 - first],
             position: vec![first],
             lateral: Vec::new(),
+            hand: vec![first, first + 2, first],
         };
         TaskSpec::new(TaskDescription {
             name: "lab/reach-1".to_owned(),
@@ -226,6 +231,7 @@ mod tests {
             origin_distance: 1.0,
             recombination_gap: 0.2,
             base: -0.5,
+            contact_distances: vec![0.1, 0.2, 0.3],
             observation_bound: vec![2.0, 2.5, 3.0, 3.5],
             goal_bound: vec![1.0, 1.5],
             manipulation: Manipulation::default(),

@@ -32,6 +32,7 @@ class TaskOptions:
     origin_distance: float = 0.0
     recombination_gap: float = 0.0
     base: float = 0.0
+    contact_distances: Sequence[float] = ()
     manipulation: Manipulation = Manipulation()
     reflection: Reflection = Reflection()
     reports_contacts: bool = False
@@ -97,6 +98,7 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         origin_distance=options.origin_distance,
         recombination_gap=options.recombination_gap,
         base=options.base,
+        contact_distances=options.contact_distances,
         manipulation=options.manipulation,
         reflection=options.reflection,
     )

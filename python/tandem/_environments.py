@@ -306,6 +306,7 @@ class EnvironmentServer(Server):
         origin_distance: float | None = None,
         recombination_gap: float | None = None,
         base: float | None = None,
+        contact_distances: Sequence[float] | None = None,
         manipulation: Manipulation | None = None,
         reflection: Reflection | None = None,
         reports_contacts: bool | None = None,
@@ -330,6 +331,7 @@ class EnvironmentServer(Server):
             "origin_distance": origin_distance,
             "recombination_gap": recombination_gap,
             "base": base,
+            "contact_distances": contact_distances,
             "manipulation": manipulation,
             "reflection": reflection,
             "reports_contacts": reports_contacts,
@@ -379,6 +381,8 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       interchangeable_arms: whether exchanging the parts of two arms gives another valid transition.
       origin_distance, recombination_gap, base: where parts of two arms from different steps may be recombined, as in
         `tandem.v1.TaskDescription`; for arms with `position`.
+      contact_distances: distances along that axis, across it and up below which two hands are in contact, for arms with
+        `hand`; transitions with contacts are then also made from steps of different episodes.
       manipulation: what the arms share, and what success needs beyond the distance to the goal (`tandem.Manipulation`).
       reflection: a mirror symmetry of the world, with which each transition is learned from in two ways
         (`tandem.Reflection`).

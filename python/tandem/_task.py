@@ -27,6 +27,8 @@ class Arm:
     """Indices, in the observation, of positions along the axis on which the arms face each other; may be empty."""
     lateral: Sequence[int] = ()
     """Indices of the coordinates of the same positions along the horizontal axis perpendicular to it; may be empty."""
+    hand: Sequence[int] = ()
+    """Indices of the three coordinates of the hand: along that axis, across it and up; may be empty."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,6 +179,9 @@ class Task:
     `lateral`."""
     base: float = 0.0
     """The coordinate of each arm's base along that axis, for arms with `lateral`."""
+    contact_distances: Sequence[float] = ()
+    """Distances along that axis, across it and up: hands that are nearer along all three are in contact. Empty if that
+    is unknown; for arms with `hand`."""
     manipulation: Manipulation = Manipulation()
     """What the arms share, and what success needs beyond the distance to the goal."""
     reflection: Reflection = Reflection()
@@ -222,6 +227,7 @@ class Task:
             origin_distance=self.origin_distance,
             recombination_gap=self.recombination_gap,
             base=self.base,
+            contact_distances=self.contact_distances,
         )
         for arm in self.arms:
             message.arms.add(
@@ -230,6 +236,7 @@ class Task:
                 action=arm.action,
                 position=arm.position,
                 lateral=arm.lateral,
+                hand=arm.hand,
             )
         if self.manipulation != Manipulation():
             message.manipulation.CopyFrom(self.manipulation.to_message())
@@ -241,7 +248,14 @@ class Task:
     def from_message(cls, message: task_pb2.TaskDescription) -> Task:
         """Returns the task that `message` describes."""
         arms = (
-            Arm(tuple(a.observation), tuple(a.goal), tuple(a.action), tuple(a.position), tuple(a.lateral))
+            Arm(
+                tuple(a.observation),
+                tuple(a.goal),
+                tuple(a.action),
+                tuple(a.position),
+                tuple(a.lateral),
+                tuple(a.hand),
+            )
             for a in message.arms
         )
         return cls(
@@ -261,6 +275,7 @@ class Task:
             origin_distance=message.origin_distance,
             recombination_gap=message.recombination_gap,
             base=message.base,
+            contact_distances=tuple(message.contact_distances),
             manipulation=Manipulation.from_message(message.manipulation),
             reflection=Reflection.from_message(message.reflection),
         )

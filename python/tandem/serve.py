@@ -64,7 +64,7 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
         "--arms",
         type=_arms,
         metavar="JSON",
-        help="list with an object per arm: lists of indices observation, goal, action and, optionally, position and lateral",
+        help="list with an object per arm: lists of indices observation, goal, action and, optionally, position, lateral and hand",
     )
     group.add_argument("--achieved-goal", type=json.loads, metavar="JSON", help="indices in the observation [found]")
     group.add_argument(
@@ -73,6 +73,13 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--origin-distance", type=float, help="between the origins of two arms along their positions")
     group.add_argument("--recombination-gap", type=float, help="smallest gap between arms that are recombined")
     group.add_argument("--base", type=float, help="coordinate of each arm's base along its positions")
+    group.add_argument(
+        "--contact-distances",
+        type=float,
+        nargs=3,
+        metavar=("ALONG", "ACROSS", "UP"),
+        help="hands that are nearer along all three axes are in contact; for arms with hand",
+    )
     group.add_argument(
         "--manipulation",
         type=_manipulation,

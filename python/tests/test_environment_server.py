@@ -349,10 +349,11 @@ def test_what_arms_share_and_success_needs_is_described() -> None:
         arms=(tandem.ArmManipulation(gripper=0, holding=held[:1], conditions=held[1:]), tandem.ArmManipulation()),
     )
     arms = [
-        tandem.Arm((2, 3), (0,), (0,), position=(3,), lateral=(2,)),
-        tandem.Arm((0, 1), (1,), (1,), position=(0,), lateral=(1,)),
+        tandem.Arm((2, 3), (0,), (0,), position=(3,), lateral=(2,), hand=(3, 2, 3)),
+        tandem.Arm((0, 1), (1,), (1,), position=(0,), lateral=(1,), hand=(0, 1, 0)),
     ]
     own = {"arms": arms, "origin_distance": 2.0, "base": -0.5, "manipulation": manipulation}
+    own["contact_distances"] = (0.5, 0.25, 0.125)
     with tandem.EnvironmentServer((ID, {"tandem_task": own})) as server:
         message = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
     first = message.manipulation.arms[0]
@@ -360,6 +361,8 @@ def test_what_arms_share_and_success_needs_is_described() -> None:
     assert message.manipulation.shared_object and message.manipulation.success_steps == 3
     assert not message.manipulation.arms[1].HasField("gripper")
     assert (message.base, [list(arm.lateral) for arm in message.arms]) == (-0.5, [[2], [1]])
+    assert [list(arm.hand) for arm in message.arms] == [[3, 2, 3], [0, 1, 0]]
+    assert list(message.contact_distances) == [0.5, 0.25, 0.125]
     assert tandem.Task.from_message(message).to_message() == message
 
 

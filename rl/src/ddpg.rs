@@ -23,7 +23,7 @@ mod state;
 mod tests;
 mod threads;
 
-use actor_half::{ActorHalf, ActorRows};
+use actor_half::{ActorHalf, ActorRows, QFilter};
 use critic_half::{CriticHalf, CriticRows};
 use network::Network;
 use threads::{for_each, in_pool};
@@ -140,6 +140,8 @@ pub struct Ddpg {
     critic: Network,
     actor_half: ActorHalf,
     critic_half: CriticHalf,
+    /// The critic's head that values each component of an action; `None` is the sum of all heads.
+    heads: Vec<Option<usize>>,
     /// Blocks of rows of the passes.
     row_blocks: Vec<Range<usize>>,
     /// One for each thread.
@@ -177,6 +179,7 @@ impl Ddpg {
             critic: network(critic_shape, 1, config.critic_learning_rate),
             actor_half: ActorHalf::new(&config, &actor_shape, &critic_shape),
             critic_half: CriticHalf::new(&config, rewards.lowest, &critic_shape),
+            heads: heads_of_actions(&layout, rewards.n_heads),
             row_blocks,
             scratch: Vec::new(),
             config,
@@ -241,16 +244,30 @@ impl Ddpg {
         enum Rows<'a> {
             Critic(CriticRows<'a>),
             Actor(ActorRows<'a>),
+            /// The filter of the actor's rows needs the values of the critic's.
+            Both(Box<(CriticRows<'a>, ActorRows<'a>)>),
         }
         let sizes = self.sizes();
-        let Self { config, actor, critic, actor_half, critic_half, row_blocks, scratch, .. } = self;
-        let (config, actor, critic) = (&*config, &*actor, &*critic);
-        let critic_rows = critic_half.rows(batch, row_blocks, sizes).into_iter().map(Rows::Critic);
-        let actor_rows = actor_half.rows(batch, row_blocks, sizes).into_iter().map(Rows::Actor);
-        let tasks = critic_rows.chain(actor_rows).collect();
-        for_each(scratch, tasks, |scratch, rows| match rows {
-            Rows::Critic(rows) => rows.differentiate(config, actor, critic, scratch),
-            Rows::Actor(rows) => rows.differentiate(config, actor, critic, scratch),
+        let Self { config, actor, critic, actor_half, critic_half, heads, .. } = self;
+        let (config, actor, critic, heads) = (&*config, &*actor, &*critic, &**heads);
+        let critic_rows = critic_half.rows(batch, &self.row_blocks, sizes).into_iter();
+        let actor_rows = actor_half.rows(batch, &self.row_blocks, sizes).into_iter();
+        let tasks = if config.bc_q_filter && config.bc_weight > 0.0 {
+            critic_rows.zip(actor_rows).map(|rows| Rows::Both(Box::new(rows))).collect()
+        } else {
+            critic_rows.map(Rows::Critic).chain(actor_rows.map(Rows::Actor)).collect()
+        };
+        for_each(&mut self.scratch, tasks, |scratch, rows| match rows {
+            Rows::Critic(rows) => {
+                rows.differentiate(config, actor, critic, scratch);
+            }
+            Rows::Actor(rows) => rows.differentiate(None, config, actor, critic, scratch),
+            Rows::Both(rows) => {
+                let (critic_rows, actor_rows) = *rows;
+                let executed_q = critic_rows.differentiate(config, actor, critic, scratch);
+                let filter = QFilter { executed_q, heads };
+                actor_rows.differentiate(Some(filter), config, actor, critic, scratch);
+            }
         });
     }
 
@@ -326,6 +343,18 @@ impl Rewards {
     pub const fn sparse(n_heads: usize) -> Self {
         Self { n_heads, lowest: -1.0 }
     }
+}
+
+/// Returns the critic's head that values each component of an action: that of the component's arm, if every arm has a
+/// head.
+fn heads_of_actions(layout: &TaskSpec, n_heads: usize) -> Vec<Option<usize>> {
+    let mut heads = vec![None; layout.n_action()];
+    if n_heads == layout.n_arms() {
+        for arm in layout.arms() {
+            layout.action_of(arm).iter().for_each(|idx| heads[idx] = Some(arm.0));
+        }
+    }
+    heads
 }
 
 /// Splits rows of `n_columns` numbers into blocks of rows.

@@ -47,6 +47,8 @@ struct Relabelled {
     keeps_goal: Vec<bool>,
     swapped: bool,
     reflected: bool,
+    /// Whether the hands are in contact, because the arms' steps are those of different episodes.
+    touches: bool,
 }
 
 /// Samples batches from a replay buffer.
@@ -73,6 +75,7 @@ impl Sampler {
             keeps_goal: vec![true; layout.n_arms()],
             swapped: false,
             reflected: false,
+            touches: false,
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
@@ -126,7 +129,7 @@ impl Sampler {
                 &mut batch.bc_mask[row_of(n_action)],
             );
             batch.rewards[row_of(n_heads)].copy_from_slice(&self.sample.rewards);
-            if has_contact_within(buffer, self.sample.steps[0], 1) {
+            if self.sample.touches || has_contact_within(buffer, self.sample.steps[0], 1) {
                 for reward in &mut batch.rewards[row_of(n_heads)] {
                     *reward -= self.contact_cost;
                 }
@@ -140,12 +143,19 @@ impl Sampler {
     fn sample_transition(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let first = self.sample_step(buffer, rng);
         self.sample.steps.fill(first);
+        self.sample.touches = false;
         let per_arm =
             self.config.reward == RewardKind::PerArm && self.layout.has_recombinable_arms();
         if bernoulli(rng, self.config.coda_fraction) && per_arm {
             let second = self.sample_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.sample.steps[1] = second;
+            } else if self.config.coda_contact_prob > 0.0
+                && would_touch(buffer, [first, second])
+                && bernoulli(rng, self.config.coda_contact_prob)
+            {
+                self.sample.steps[1] = second;
+                self.sample.touches = true;
             }
         }
         self.sample.swapped =
@@ -341,7 +351,9 @@ impl Sampler {
             }
             let is_advised = buffer.advised_arms(episode_idx, step_idx) >> from.0 & 1 == 1;
             let foresight = self.config.contact_foresight_steps;
-            let is_cloned = is_advised && !has_contact_within(buffer, step, foresight);
+            let leads_to_contact =
+                self.sample.touches || has_contact_within(buffer, step, foresight);
+            let is_cloned = is_advised && !leads_to_contact;
             self.layout.action_of(to).fill(bc_mask, if is_cloned { 1.0 } else { 0.0 });
         }
     }
@@ -373,6 +385,13 @@ fn write_goal(
 fn has_contact_within(buffer: &ReplayBuffer, first: StepIndex, n_steps: usize) -> bool {
     let end = (first.step_idx + n_steps).min(buffer.layout().episode_steps());
     buffer.has_contact(first.step_idx..end, first.episode_idx)
+}
+
+/// Returns true if the hands of two arms touch after they take these steps at the same time.
+fn would_touch(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
+    let after = steps
+        .map(|StepIndex { episode_idx, step_idx }| buffer.observation(episode_idx, step_idx + 1));
+    separation::would_touch(buffer.layout(), after)
 }
 
 /// Returns true if two arms cannot meet when they take these steps at the same time: neither step has a contact, and

@@ -33,6 +33,7 @@ pub(crate) fn two_arms() -> TaskSpec {
             action: own,
             position: Vec::new(),
             lateral: Vec::new(),
+            hand: Vec::new(),
         }
     };
     let description = TaskDescription {
@@ -49,6 +50,7 @@ pub(crate) fn two_arms() -> TaskSpec {
         origin_distance: 0.0,
         recombination_gap: 0.0,
         base: 0.0,
+        contact_distances: Vec::new(),
         observation_bound: vec![3.0; 4],
         goal_bound: vec![1.0; 4],
         manipulation: Manipulation::default(),

@@ -269,6 +269,7 @@ mod tests {
             action: vec![1 - arm_idx],
             position: Vec::new(),
             lateral: Vec::new(),
+            hand: Vec::new(),
         };
         let task = TaskSpec::new(TaskDescription {
             name: "interleaved".to_owned(),

@@ -16,6 +16,9 @@ use crate::layout::{
 const RECOMBINATION_GAP_M: f32 = 0.10;
 /// The same in the plane, in the shared world: a hand is at most 0.12 m wide and moves up to 0.05 m per step.
 const SHARED_RECOMBINATION_GAP_M: f32 = 0.16;
+/// Distances along x, y and z below which two hands of the shared world are in contact. They are somewhat smaller than
+/// those of all hands that touch: what has these distances certainly does.
+const SHARED_CONTACT_DISTANCES_M: [f32; 3] = [0.065, 0.08, 0.15];
 /// Position of each arm's base, arm frame, metres: the simulator's.
 const BASE_X_M: f32 = -0.30;
 
@@ -54,6 +57,11 @@ impl Layout {
                 action: self.action_of(arm).collect(),
                 position: if is_recombined { position } else { Vec::new() },
                 lateral: if is_recombined && is_shared { lateral } else { Vec::new() },
+                hand: if is_recombined && is_shared {
+                    HAND_POSITION.map(|idx| observation.start + idx).collect()
+                } else {
+                    Vec::new()
+                },
             }
         };
         let if_several = |value| if is_recombined { value } else { 0.0 };
@@ -76,6 +84,11 @@ impl Layout {
                 RECOMBINATION_GAP_M
             }),
             base: if is_shared { if_several(BASE_X_M) } else { 0.0 },
+            contact_distances: if is_shared && is_recombined {
+                SHARED_CONTACT_DISTANCES_M.to_vec()
+            } else {
+                Vec::new()
+            },
             observation_bound: (0..self.n_observation())
                 .map(|idx| self.observation_bound(idx))
                 .collect(),

@@ -122,6 +122,14 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
         InvalidTask::unless(is_valid, field, "a finite number, 0 or more", value)?;
     }
     InvalidTask::unless(task.base.is_finite(), "base", "a finite number", task.base)?;
+    let distances = &task.contact_distances;
+    let has_hands = task.arms.iter().all(|arm| arm.hand.len() == 3);
+    let is_valid = distances.is_empty()
+        || (distances.len() == 3
+            && distances.iter().all(|distance| distance.is_finite() && *distance > 0.0)
+            && has_hands);
+    let expected = "none, or three finite numbers above 0 for arms with hands";
+    InvalidTask::unless(is_valid, "contact_distances", expected, format_args!("{distances:?}"))?;
     let has_common = has_common_numbers(task);
     for (arm_idx, arm) in task.arms.iter().enumerate() {
         let achieves_own =
@@ -132,6 +140,11 @@ fn check_recombination(task: &TaskDescription) -> Result<(), InvalidTask> {
                         and these positions belong to the arm";
         let got = format_args!("{} indices", arm.position.len()).to_string();
         InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].position"), expected, got)?;
+        let is_own = arm.hand.iter().all(|idx| arm.observation.contains(idx));
+        let is_valid = arm.hand.is_empty() || (arm.hand.len() == 3 && is_own);
+        let expected = "no index, or three of the arm's own";
+        let got = format_args!("{:?}", arm.hand).to_string();
+        InvalidTask::unless(is_valid, format_args!("arms[{arm_idx}].hand"), expected, got)?;
         let is_own = arm.lateral.iter().all(|idx| arm.observation.contains(idx));
         let n_lateral = arm.lateral.len();
         let is_valid = n_lateral == 0 || (n_lateral == arm.position.len() && is_own);

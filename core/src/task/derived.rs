@@ -39,12 +39,14 @@ impl TaskSpec {
                 action: own(arm.action.len()),
                 position: Vec::new(),
                 lateral: Vec::new(),
+                hand: Vec::new(),
             }],
             achieved_goal,
             interchangeable_arms: false,
             origin_distance: 0.0,
             recombination_gap: 0.0,
             base: 0.0,
+            contact_distances: Vec::new(),
             observation_bound: bounds(observation, &description.observation_bound),
             goal_bound: bounds(goal, &description.goal_bound),
             name: match description.manipulation.one_arm_task.as_str() {
@@ -80,6 +82,7 @@ impl TaskSpec {
                 action: shifted(arm_idx, &arm.action, one.n_action),
                 position: Vec::new(),
                 lateral: Vec::new(),
+                hand: Vec::new(),
             })
         });
         let achieved_goal =

@@ -51,6 +51,10 @@ pub struct TaskDescription {
     /// occupies the plane.
     #[serde(default)]
     pub base: f32,
+    /// Distances along that axis, across it and up: hands ([`ArmDescription::hand`]) that are nearer to each other along all
+    /// three are in contact. Three numbers, or none if that is unknown.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub contact_distances: Vec<f32>,
     /// Largest magnitude of each number of an observation, shape `[n_observation]`.
     pub observation_bound: Vec<f32>,
     /// Largest magnitude of each number of a goal, shape `[n_goal]`.
@@ -87,6 +91,10 @@ pub struct ArmDescription {
     /// Empty: only the distance along the first axis counts.
     #[serde(default)]
     pub lateral: Vec<usize>,
+    /// Indices, in the observation, of the three coordinates of the hand: along that axis, across it and up. Empty: the
+    /// description says nothing about contacts.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub hand: Vec<usize>,
 }
 
 /// The norm of the difference between an achieved and a desired goal.
@@ -188,7 +196,7 @@ impl TaskDescription {
             }
         }
         compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
-        compare!(reports_contacts, origin_distance, recombination_gap, base);
+        compare!(reports_contacts, origin_distance, recombination_gap, base, contact_distances);
         compare!(observation_bound, goal_bound, manipulation, reflection);
         None
     }
@@ -196,13 +204,14 @@ impl TaskDescription {
 
 impl ArmDescription {
     /// Returns the name and the indices of each field.
-    pub(super) const fn fields(&self) -> [(&'static str, &Vec<usize>); 5] {
+    pub(super) const fn fields(&self) -> [(&'static str, &Vec<usize>); 6] {
         [
             ("observation", &self.observation),
             ("goal", &self.goal),
             ("action", &self.action),
             ("position", &self.position),
             ("lateral", &self.lateral),
+            ("hand", &self.hand),
         ]
     }
 }

@@ -10,6 +10,7 @@ fn interleaved() -> TaskDescription {
         action: vec![1 - first],
         position: vec![first],
         lateral: Vec::new(),
+        hand: Vec::new(),
     };
     TaskDescription {
         name: "lab/reach-1".to_owned(),
@@ -26,6 +27,7 @@ fn interleaved() -> TaskDescription {
         origin_distance: 1.0,
         recombination_gap: 0.2,
         base: 0.0,
+        contact_distances: Vec::new(),
         observation_bound: vec![2.0; 4],
         goal_bound: vec![1.0; 2],
         manipulation: Manipulation::default(),
@@ -239,6 +241,28 @@ fn a_common_goal_counts_for_every_arm_and_has_no_one_arm_task() {
     assert_eq!(task.goal_distances(&[9.0, 9.0, 0.25], &[0.5]), [0.0, 0.0, 0.25]);
     assert_eq!(task.single_arm(), None);
     assert!(!task.has_recombinable_arms());
+}
+
+#[test]
+fn distances_of_contacts_need_hands() {
+    let with = |hand: bool, distances: &[f32]| {
+        let mut description = interleaved();
+        for (arm_idx, arm) in description.arms.iter_mut().enumerate().filter(|_| hand) {
+            arm.hand = vec![arm_idx, arm_idx + 2, arm_idx];
+        }
+        description.contact_distances = distances.to_vec();
+        TaskSpec::new(description).map(|task| task.describes_contacts())
+    };
+    assert_eq!((with(true, &[0.1; 3]), with(true, &[])), (Ok(true), Ok(false)));
+    for (hand, distances) in [
+        (false, &[0.1; 3][..]),
+        (true, &[0.1; 2]),
+        (true, &[0.1, 0.0, 0.1]),
+        (true, &[f32::NAN; 3]),
+    ] {
+        let refused = with(hand, distances).unwrap_err();
+        assert_eq!(refused.field, "contact_distances", "{distances:?}");
+    }
 }
 
 #[test]

@@ -207,6 +207,7 @@ fn write_tasks(to: &Path) -> Result<(), AnyError> {
     // Two points whose numbers alternate, and which carry an object to a common goal.
     let arm = |arm_idx: usize| ArmDescription {
         lateral: Vec::new(),
+        hand: Vec::new(),
         observation: vec![arm_idx, arm_idx + 2],
         goal: vec![arm_idx],
         action: vec![arm_idx],
@@ -214,6 +215,7 @@ fn write_tasks(to: &Path) -> Result<(), AnyError> {
     };
     let carry = TaskDescription {
         base: 0.0,
+        contact_distances: Vec::new(),
         name: "lab/carry".to_owned(),
         n_observation: 5,
         n_goal: 3,

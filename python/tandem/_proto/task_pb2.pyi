@@ -17,7 +17,7 @@ NORM_EUCLIDEAN: Norm
 NORM_MAXIMUM: Norm
 
 class TaskDescription(_message.Message):
-    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base", "manipulation", "reflection")
+    __slots__ = ("name", "n_observation", "n_goal", "n_action", "arms", "achieved_goal", "episode_steps", "tolerance", "norm", "interchangeable_arms", "reports_contacts", "observation_bound", "goal_bound", "origin_distance", "recombination_gap", "base", "manipulation", "reflection", "contact_distances")
     NAME_FIELD_NUMBER: _ClassVar[int]
     N_OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     N_GOAL_FIELD_NUMBER: _ClassVar[int]
@@ -36,6 +36,7 @@ class TaskDescription(_message.Message):
     BASE_FIELD_NUMBER: _ClassVar[int]
     MANIPULATION_FIELD_NUMBER: _ClassVar[int]
     REFLECTION_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_DISTANCES_FIELD_NUMBER: _ClassVar[int]
     name: str
     n_observation: int
     n_goal: int
@@ -54,7 +55,8 @@ class TaskDescription(_message.Message):
     base: float
     manipulation: TaskManipulation
     reflection: Reflection
-    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ..., reflection: _Optional[_Union[Reflection, _Mapping]] = ...) -> None: ...
+    contact_distances: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ..., reflection: _Optional[_Union[Reflection, _Mapping]] = ..., contact_distances: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Reflection(_message.Message):
     __slots__ = ("observation", "goal", "action", "moved", "position", "plane")
@@ -112,15 +114,17 @@ class Condition(_message.Message):
     def __init__(self, numbers: _Optional[_Iterable[int]] = ..., target: _Optional[_Iterable[float]] = ..., tolerance: _Optional[float] = ...) -> None: ...
 
 class TaskArm(_message.Message):
-    __slots__ = ("observation", "goal", "action", "position", "lateral")
+    __slots__ = ("observation", "goal", "action", "position", "lateral", "hand")
     OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     GOAL_FIELD_NUMBER: _ClassVar[int]
     ACTION_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
     LATERAL_FIELD_NUMBER: _ClassVar[int]
+    HAND_FIELD_NUMBER: _ClassVar[int]
     observation: _containers.RepeatedScalarFieldContainer[int]
     goal: _containers.RepeatedScalarFieldContainer[int]
     action: _containers.RepeatedScalarFieldContainer[int]
     position: _containers.RepeatedScalarFieldContainer[int]
     lateral: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., position: _Optional[_Iterable[int]] = ..., lateral: _Optional[_Iterable[int]] = ...) -> None: ...
+    hand: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., position: _Optional[_Iterable[int]] = ..., lateral: _Optional[_Iterable[int]] = ..., hand: _Optional[_Iterable[int]] = ...) -> None: ...

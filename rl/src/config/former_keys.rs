@@ -20,7 +20,7 @@ pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"
 
 /// Settings that earlier versions did not have, and the values that mean what those versions did, as JSON and TOML. A
 /// file with all settings of an earlier version, and a checkpoint, have these values where they have none.
-pub const ADDED: [(&str, &str); 10] = [
+pub const ADDED: [(&str, &str); 12] = [
     ("advice.budget_scope", "\"run\""),
     ("advice.unit", "\"env-step\""),
     ("advice.judged_action", "\"executed\""),
@@ -28,8 +28,10 @@ pub const ADDED: [(&str, &str); 10] = [
     ("exploration.joint_random_actions", "false"),
     ("replay.joint_goal_statistics", "false"),
     ("replay.reflection_prob", "0.0"),
+    ("replay.coda_contact_prob", "0.0"),
     ("ddpg.batches_per_update", "1"),
     ("ddpg.bc_final_fraction", "1.0"),
+    ("ddpg.bc_q_filter", "false"),
     ("evaluation.early_points", "0"),
 ];
 

@@ -20,6 +20,8 @@ pub(super) struct ActorHalf {
     q_gradient: Vec<f32>,
     /// The loss's gradient by the action, then by the action before its tanh, shape `[b, n_action]`.
     action_gradient: Vec<f32>,
+    /// The batch's mask of behaviour cloning, without what the filter leaves out, shape `[b, n_action]`.
+    bc_mask: Vec<f32>,
     /// Of the actions.
     activations: Activations,
 }
@@ -32,6 +34,7 @@ pub(super) struct ActorRows<'a> {
     q: &'a mut [f32],
     q_gradient: &'a [f32],
     action_gradient: &'a mut [f32],
+    bc_mask: &'a mut [f32],
     activations: RowBlock<'a>,
 }
 
@@ -43,6 +46,7 @@ impl ActorHalf {
             q: vec![0.0; b * critic.n_output],
             q_gradient: vec![-1.0 / config.batch_size as f32; b * critic.n_output],
             action_gradient: vec![0.0; b * actor.n_output],
+            bc_mask: vec![0.0; b * actor.n_output],
             activations: Activations::new(actor, b),
         }
     }
@@ -54,11 +58,12 @@ impl ActorHalf {
         blocks: &[Range<usize>],
         sizes: Sizes,
     ) -> Vec<ActorRows<'a>> {
-        let Self { input, q, q_gradient, action_gradient, activations } = self;
+        let Self { input, q, q_gradient, action_gradient, bc_mask, activations } = self;
         let q_gradient = &**q_gradient;
         let mut inputs = split_rows(input, sizes.n_input + sizes.n_action, blocks);
         let mut qs = split_rows(q, sizes.n_heads, blocks);
         let mut action_gradients = split_rows(action_gradient, sizes.n_action, blocks);
+        let mut bc_masks = split_rows(bc_mask, sizes.n_action, blocks);
         let rows =
             blocks.iter().zip(activations.blocks(blocks)).map_while(|(block, activations)| {
                 Some(ActorRows {
@@ -67,6 +72,7 @@ impl ActorHalf {
                     q: qs.next()?,
                     q_gradient: &q_gradient[..block.len() * sizes.n_heads],
                     action_gradient: action_gradients.next()?,
+                    bc_mask: bc_masks.next()?,
                     activations,
                 })
             });
@@ -91,7 +97,7 @@ impl ActorHalf {
         let n_joined = self.input.len() / b;
         let terms = ActionTerms::new(config, n_action);
         let executed_rows =
-            batch.actions.chunks_exact(n_action).zip(batch.bc_mask.chunks_exact(n_action));
+            batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let mut loss = 0.0;
         for (input, (executed, bc_mask)) in self.input.chunks_exact(n_joined).zip(executed_rows) {
             let actions = &input[n_joined - n_action..];
@@ -106,9 +112,11 @@ impl ActorHalf {
 }
 
 impl ActorRows<'_> {
-    /// Computes the actions, their values and the gradients of the actor's loss by all activations of the actor.
+    /// Computes the actions, their values and the gradients of the actor's loss by all activations of the actor. Advice is
+    /// cloned where `filter` keeps it.
     pub(super) fn differentiate(
         mut self,
+        filter: Option<QFilter<'_>>,
         config: &DdpgConfig,
         actor: &Network,
         critic: &Network,
@@ -138,6 +146,11 @@ impl ActorRows<'_> {
             &mut MatrixMut::new(self.q, n_rows, n_heads),
         );
 
+        self.bc_mask.copy_from_slice(self.batch.bc_mask);
+        if let Some(filter) = filter {
+            filter.apply(self.q, self.bc_mask);
+        }
+
         // -Q summed over the heads, by the action.
         values.backward(&critic.shape, &critic.online, self.q_gradient);
         values.input_gradient(
@@ -156,11 +169,8 @@ impl ActorRows<'_> {
     fn add_action_terms(&mut self, config: &DdpgConfig, n_input: usize) {
         let n_action = self.action_gradient.len() / self.batch.n_rows;
         let terms = ActionTerms::new(config, n_action);
-        let executed_rows = self
-            .batch
-            .actions
-            .chunks_exact(n_action)
-            .zip(self.batch.bc_mask.chunks_exact(n_action));
+        let executed_rows =
+            self.batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let rows = self
             .action_gradient
             .chunks_exact_mut(n_action)
@@ -170,6 +180,37 @@ impl ActorRows<'_> {
                 let action = input[n_input + i];
                 gradient[i] += terms.gradient(action, bc_mask[i] * (action - executed[i]));
                 gradient[i] *= 1.0 - action * action;
+            }
+        }
+    }
+}
+
+/// Leaves advice out of cloning that is worth no more than the actor's own action.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct QFilter<'a> {
+    /// Values of the executed actions, shape `[n_rows, n_heads]`.
+    pub(super) executed_q: &'a [f32],
+    /// The head that values each component of an action, shape `[n_action]`; `None` is the sum of all heads.
+    pub(super) heads: &'a [Option<usize>],
+}
+
+impl QFilter<'_> {
+    /// Sets components of `bc_mask`, shape `[n_rows, n_action]`, to 0. `own_q` has the values of the actor's actions, shape
+    /// `[n_rows, n_heads]`.
+    pub(super) fn apply(self, own_q: &[f32], bc_mask: &mut [f32]) {
+        let n_rows = bc_mask.len() / self.heads.len();
+        let n_heads = own_q.len() / n_rows;
+        let values = self.executed_q.chunks_exact(n_heads).zip(own_q.chunks_exact(n_heads));
+        for ((executed, own), mask) in values.zip(bc_mask.chunks_exact_mut(self.heads.len())) {
+            let gain = |head: usize| executed[head] - own[head];
+            for (mask, head) in mask.iter_mut().zip(self.heads) {
+                let is_better = match head {
+                    Some(head) => gain(*head) > 0.0,
+                    None => (0..n_heads).map(gain).sum::<f32>() > 0.0,
+                };
+                if !is_better {
+                    *mask = 0.0;
+                }
             }
         }
     }

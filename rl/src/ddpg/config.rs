@@ -24,6 +24,10 @@ pub struct DdpgConfig {
     /// to three quarters of `stop.max_env_steps`; a run without that limit keeps it.
     #[serde(default = "all_of_it")]
     pub bc_final_fraction: f32,
+    /// Whether advice is cloned only where the critic values it above the actor's own action: the Q-filter of Nair et al.
+    /// 2018, equation 4. With a value per arm, the advice to an arm is compared by the arm's own value.
+    #[serde(default)]
+    pub bc_q_filter: bool,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It
     /// is Spinning Up's `polyak`, and 1 - `tau` of Stable-Baselines3.
     pub polyak_keep: f32,
@@ -56,6 +60,7 @@ impl Default for DdpgConfig {
             action_penalty: 0.1,
             bc_weight: 2.0,
             bc_final_fraction: all_of_it(),
+            bc_q_filter: false,
             polyak_keep: 0.95,
             actor_learning_rate: 1e-3,
             critic_learning_rate: 1e-3,

@@ -102,15 +102,16 @@ impl CriticHalf {
     }
 }
 
-impl CriticRows<'_> {
-    /// Computes the values, their targets and the gradients of the critic's loss by all activations.
+impl<'a> CriticRows<'a> {
+    /// Computes the values, their targets and the gradients of the critic's loss by all activations. Returns the values
+    /// of the executed actions, shape `[n_rows, n_heads]`.
     pub(super) fn differentiate(
         mut self,
         config: &DdpgConfig,
         actor: &Network,
         critic: &Network,
         scratch: &mut Scratch,
-    ) {
+    ) -> &'a [f32] {
         let BatchRows { n_rows, inputs, actions, rewards, next_inputs, .. } = self.batch;
         let (n_input, n_action) = (actor.shape.n_input, actor.shape.n_output);
         let (n_joined, n_heads) = (critic.shape.n_input, critic.shape.n_output);
@@ -156,6 +157,7 @@ impl CriticRows<'_> {
             *gradient = 2.0 * error / config.batch_size as f32;
         }
         self.activations.backward(&critic.shape, &critic.online, self.q_gradient);
+        self.q
     }
 }
 

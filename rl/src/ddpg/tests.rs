@@ -4,8 +4,9 @@ use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_policy::MlpShape;
 
+use super::actor_half::QFilter;
 use super::critic_half::critic_target;
-use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses};
+use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses, heads_of_actions};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
@@ -86,14 +87,23 @@ fn actor_loss(ddpg: &Ddpg, actor: &[f64], batch: &Batch) -> f64 {
     let (actor_shape, critic) = (ddpg.actor_shape(), exact(ddpg.critic()));
     let config = ddpg.config();
     let b = config.batch_size as f64;
+    let value = |input: &[f64], action: &[f64]| {
+        let q = network(ddpg.critic_shape(), &critic, [input, action].concat());
+        q.iter().sum::<f64>()
+    };
+    // The filter has no gradient: it compares the actions before the update.
+    let is_cloned = |row: usize, input: &[f64]| {
+        let executed = exact(&batch.actions[row * 3..row * 3 + 3]);
+        let own = policy(actor_shape, &exact(ddpg.actor()), input);
+        !config.bc_q_filter || value(input, &executed) > value(input, &own)
+    };
     let mut loss = 0.0;
     for (row, input) in exact(&batch.inputs).chunks(actor_shape.n_input).enumerate() {
         let action = policy(actor_shape, actor, input);
-        let q = network(ddpg.critic_shape(), &critic, [input, &action].concat());
-        loss -= q.iter().sum::<f64>() / b;
+        loss -= value(input, &action) / b;
         for (i, action) in action.iter().enumerate() {
             loss += f64::from(config.action_penalty) * action * action / (b * 3.0);
-            if batch.bc_mask[row * 3 + i] > 0.0 {
+            if batch.bc_mask[row * 3 + i] > 0.0 && is_cloned(row, input) {
                 let error = action - f64::from(batch.actions[row * 3 + i]);
                 loss += f64::from(config.bc_weight) * error * error / b;
             }
@@ -140,6 +150,25 @@ fn both_gradients_agree_with_finite_differences() {
     check(1, |config| config.action_penalty = 3.0);
     check(1, |config| config.bc_weight = 4.0);
     check(2, |config| (config.action_penalty, config.bc_weight) = (0.5, 2.0));
+    check(1, |config| (config.bc_weight, config.bc_q_filter) = (4.0, true));
+    check(2, |config| (config.bc_weight, config.bc_q_filter) = (4.0, true));
+}
+
+#[test]
+fn the_filter_keeps_advice_to_an_arm_that_its_own_value_prefers() {
+    let layout = Layout::new(Task::Push, 2);
+    assert_eq!(heads_of_actions(&layout.into(), 1), [None; 6]);
+    let heads = heads_of_actions(&layout.into(), 2);
+    assert_eq!(heads, [0, 0, 0, 1, 1, 1].map(Some));
+    let filter = QFilter { executed_q: &[-1.0, -5.0, -2.0, -2.0], heads: &heads };
+    let mut bc_mask = vec![1.0; 12];
+    bc_mask[0] = 0.0;
+    filter.apply(&[-2.0, -3.0, -2.0, -4.0], &mut bc_mask);
+    assert_eq!(bc_mask, [0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
+    let joint = QFilter { heads: &[None; 6], ..filter };
+    let mut bc_mask = vec![1.0; 12];
+    joint.apply(&[-2.0, -3.0, -2.0, -4.0], &mut bc_mask);
+    assert_eq!(bc_mask, [[0.0; 6], [1.0; 6]].concat());
 }
 
 /// Learns on `n_threads` threads from batches of `batch_size` and returns the state and the losses.
@@ -166,11 +195,15 @@ fn any_number_of_threads_gives_the_same_bits() {
     let single = small(|config| {
         (config.n_hidden, config.batch_size, config.batches_per_update) = (64, 300, 2);
     });
+    let filtered = small(|config| {
+        (config.n_hidden, config.batch_size) = (64, 300);
+        (config.bc_weight, config.bc_q_filter) = (2.0, true);
+    });
     let on = |n_pool, config, n_heads, n_threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_pool).build().unwrap();
         pool.install(|| learn(config, n_heads, n_threads))
     };
-    for (config, n_heads) in [(&narrow, 2), (&uneven, 2), (&single, 1)] {
+    for (config, n_heads) in [(&narrow, 2), (&uneven, 2), (&single, 1), (&filtered, 2)] {
         let alone = learn(config, n_heads, 1);
         for n_threads in [2, 3, 5, 16] {
             let together = on(n_threads, config, n_heads, n_threads);

@@ -45,6 +45,11 @@ pub struct ReplayConfig {
     /// (CoDA, Pitis et al. 2020). A combination in which the arms are near each other is rejected. It takes effect with
     /// `replay.reward = "per-arm"` and tasks whose arms can be recombined only.
     pub coda_fraction: f32,
+    /// Probability, in [0, 1], that two steps after which the hands of both arms would overlap are combined into a
+    /// transition with a contact. It takes effect where `replay.coda_fraction` does, in tasks that describe at which
+    /// distance hands are in contact, as those of the shared world do.
+    #[serde(default)]
+    pub coda_contact_prob: f32,
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
     /// interchangeable.
     pub arm_swap_prob: f32,
@@ -96,6 +101,7 @@ impl ReplayConfig {
             ("replay.her_ratio", self.her_ratio),
             ("replay.displaced_fraction", self.displaced_fraction),
             ("replay.coda_fraction", self.coda_fraction),
+            ("replay.coda_contact_prob", self.coda_contact_prob),
             ("replay.arm_swap_prob", self.arm_swap_prob),
             ("replay.reflection_prob", self.reflection_prob),
         ];

@@ -40,6 +40,22 @@ pub(super) fn are_apart(layout: &TaskSpec, observations: [&[f32]; 2]) -> bool {
         })
 }
 
+/// Returns true if the hands of the first arm as in the first observation and of the second arm as in the second one are
+/// so near to each other that they are in contact, as far as the task says.
+pub(super) fn would_touch(layout: &TaskSpec, observations: [&[f32]; 2]) -> bool {
+    let task = layout.description();
+    if task.contact_distances.is_empty() {
+        return false;
+    }
+    let [first, second] = [ArmIndex(0), ArmIndex(1)].map(|arm| {
+        let hand = layout.hand_of(arm).of(observations[arm.0]);
+        let [x, y] = in_plane(task.origin_distance, arm.0, [hand[0], hand[1]]);
+        [x, y, hand[2]]
+    });
+    let gaps = first.iter().zip(second).map(|(first, second)| (first - second).abs());
+    gaps.zip(&task.contact_distances).all(|(gap, distance)| gap < *distance)
+}
+
 /// Converts a point from the frame of `arm` to that of the first arm. The arms face each other.
 const fn in_plane(origin_distance: f32, arm: usize, [x, y]: Point) -> Point {
     if arm == 0 { [x, y] } else { [origin_distance - x, -y] }
@@ -106,6 +122,7 @@ mod tests {
         for (arm, part) in description.arms.iter_mut().zip([0, 28]) {
             arm.position = vec![part, part + 3];
             arm.lateral = vec![part + 1, part + 4];
+            arm.hand = vec![part, part + 1, part + 2];
         }
         TaskSpec::new(description).unwrap()
     }
@@ -141,6 +158,29 @@ mod tests {
         // In the second arm's frame the first hand is at x = 0.34.
         check(hands, [[0.0, 0.2], [0.0, 0.2]], true);
         check(hands, [[0.0, 0.2], [0.30, 0.0]], false);
+    }
+
+    #[test]
+    fn hands_touch_that_are_near_along_all_axes() {
+        let mut description = task().description().clone();
+        description.contact_distances = vec![0.065, 0.08, 0.15];
+        let described = TaskSpec::new(description).unwrap();
+        let middle = 0.5 * described.description().origin_distance;
+        // In their own frames: the second arm faces the first one.
+        for (first, second, expected) in [
+            ([middle, 0.0, 0.1], [middle, 0.0, 0.1], true),
+            ([middle, 0.04, 0.1], [middle - 0.06, 0.03, 0.2], true),
+            ([middle, 0.0, 0.1], [middle - 0.07, 0.0, 0.1], false),
+            ([middle, 0.04, 0.1], [middle, 0.05, 0.1], false),
+            ([middle, 0.0, 0.3], [middle, 0.0, 0.1], false),
+        ] {
+            let mut observation = vec![0.0; 56];
+            observation[..3].copy_from_slice(&first);
+            observation[28..31].copy_from_slice(&second);
+            let both = [observation.as_slice(), &observation];
+            assert_eq!(would_touch(&described, both), expected, "{first:?}, {second:?}");
+            assert!(!would_touch(&task(), both), "a task that does not say so");
+        }
     }
 
     #[test]

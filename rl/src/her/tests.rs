@@ -17,6 +17,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
         displaced_hindsight: false,
         displaced_fraction: 0.5,
         coda_fraction: 0.0,
+        coda_contact_prob: 0.0,
         arm_swap_prob: 0.5,
         reflection_prob: 0.0,
         reward,
@@ -347,6 +348,60 @@ fn arms_of_different_steps_are_combined_where_they_cannot_meet() {
     }
     assert!(n_combined > N_DRAWS / 10);
     assert!((largest_x - 0.14).abs() < 0.005, "0.24 m apart, {largest_x} m towards the other");
+}
+
+#[test]
+fn steps_after_which_hands_would_overlap_make_a_contact() {
+    let layout = Layout::new(Task::SharedPush, 2);
+    // Each arm has its hand in the middle in one episode, and far back in the other.
+    let episode_of = |number: u64, in_middle: usize| {
+        let mut episode = Episode::zeros(layout, number);
+        episode.goal.fill(9.0);
+        episode.actions.fill(0.1 * number as f32);
+        episode.advised_arms.fill(0b11);
+        for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
+            for arm in layout.arms() {
+                let part = &mut observation[layout.observation_of(arm)];
+                let x = if arm.0 == in_middle { 0.12 } else { -0.2 };
+                part[..5].copy_from_slice(&[x, 0.0, 0.0, -0.1, 0.1]);
+            }
+        }
+        episode
+    };
+    let mut buffer = ReplayBuffer::new(layout, 1000);
+    buffer.push(&episode_of(0, 0));
+    buffer.push(&episode_of(1, 1));
+    let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
+    let (observation, goal) = (identity(56), identity(6));
+    let statistics = Statistics { observation: &observation, goal: &goal };
+    let n_contacts = |coda_contact_prob| {
+        let config = ReplayConfig {
+            coda_contact_prob,
+            coda_fraction: 1.0,
+            arm_swap_prob: 0.0,
+            her_ratio: 0.0,
+            contact_cost: 0.75,
+            contact_foresight_steps: 3,
+            ..config(RewardKind::PerArm)
+        };
+        let mut batch = Batch::new(layout, 2, 400);
+        let mut rng = episode_rng(3, 0, Stream::Replay);
+        Sampler::new(&config, layout).fill(&buffer, statistics, &mut rng, &mut batch);
+        let rows = batch.actions.chunks_exact(6).zip(batch.bc_mask.chunks_exact(6));
+        let touches =
+            rows.zip(batch.rewards.chunks_exact(2)).map(|((action, bc_mask), rewards)| {
+                // The first arm's part is from the first episode, the second arm's from the second one.
+                let touches = (action[0], action[3]) == (0.0, 0.1);
+                assert_eq!(rewards, if touches { [-1.75; 2] } else { [-1.0; 2] });
+                assert_eq!(bc_mask, if touches { [0.0; 6] } else { [1.0; 6] });
+                touches
+            });
+        touches.filter(|touches| *touches).count()
+    };
+    assert_eq!(n_contacts(0.0), 0);
+    let (half, all) = (n_contacts(0.5), n_contacts(1.0));
+    assert!((70..130).contains(&all), "a quarter of 400: {all}");
+    assert!((30..70).contains(&half), "an eighth of 400: {half}");
 }
 
 /// The task of [`LAYOUT`] with the arms' numbers interleaved in every vector: number `i` of arm `a` has index `2 i + a`.

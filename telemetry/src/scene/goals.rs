@@ -136,6 +136,7 @@ mod tests {
             action: vec![arm_idx],
             position: Vec::new(),
             lateral: Vec::new(),
+            hand: Vec::new(),
         };
         let description = TaskDescription {
             name: "lab/reach".to_owned(),
@@ -150,6 +151,7 @@ mod tests {
             reports_contacts: false,
             origin_distance: 0.0,
             base: 0.0,
+            contact_distances: Vec::new(),
             recombination_gap: 0.0,
             observation_bound: vec![1.0; n_goal],
             goal_bound: vec![1.0; n_goal],

@@ -68,10 +68,12 @@ pub(crate) fn described(n_goal_per_arm: usize) -> TaskSpec {
         action: part(2, arm_idx),
         position: Vec::new(),
         lateral: Vec::new(),
+        hand: Vec::new(),
     };
     let achieved = |arm_idx| (0..n_goal_per_arm).map(move |idx| arm_idx * N_OBSERVATION + idx);
     TaskSpec::new(TaskDescription {
         base: 0.0,
+        contact_distances: Vec::new(),
         name: "lab/reach".to_owned(),
         n_observation: 2 * N_OBSERVATION,
         n_goal: 2 * n_goal_per_arm,
