@@ -367,6 +367,14 @@ impl RunConfig {
         self.ddpg.bc_weight * (1.0 - self.share_of_middle_half(round) * loss)
     }
 
+    /// Returns true if advice is filtered before it is cloned in round `round`, from 0.
+    #[must_use]
+    pub fn filters_advice(&self, round: u64) -> bool {
+        let start = f64::from(self.ddpg.bc_filter_start) * self.stop.max_env_steps as f64;
+        let is_limited = self.stop.max_env_steps > 0 && self.ddpg.bc_filter_start < 1.0;
+        is_limited && (round * self.env_steps_per_round()) as f64 >= start
+    }
+
     /// Returns the share of the middle half of the run's environment steps that lies before round `round`, in [0, 1]. It
     /// is 0 in a run without a limit in environment steps.
     #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]

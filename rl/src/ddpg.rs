@@ -135,6 +135,8 @@ pub enum DdpgError {
 #[derive(Debug, Clone)]
 pub struct Ddpg {
     config: DdpgConfig,
+    /// Whether advice is cloned only where the critic values it above the actor's own action.
+    filters_advice: bool,
     n_updates: u64,
     actor: Network,
     critic: Network,
@@ -174,6 +176,7 @@ impl Ddpg {
         let critic_shape = MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads);
         let row_blocks = critic_shape.row_blocks(config.transitions_per_update());
         let mut ddpg = Self {
+            filters_advice: false,
             n_updates: 0,
             actor: network(actor_shape, 0, config.actor_learning_rate),
             critic: network(critic_shape, 1, config.critic_learning_rate),
@@ -252,7 +255,7 @@ impl Ddpg {
         let (config, actor, critic, heads) = (&*config, &*actor, &*critic, &**heads);
         let critic_rows = critic_half.rows(batch, &self.row_blocks, sizes).into_iter();
         let actor_rows = actor_half.rows(batch, &self.row_blocks, sizes).into_iter();
-        let tasks = if config.bc_q_filter && config.bc_weight > 0.0 {
+        let tasks = if self.filters_advice && config.bc_weight > 0.0 {
             critic_rows.zip(actor_rows).map(|rows| Rows::Both(Box::new(rows))).collect()
         } else {
             critic_rows.map(Rows::Critic).chain(actor_rows.map(Rows::Actor)).collect()
@@ -308,6 +311,11 @@ impl Ddpg {
     /// Sets the weight of behaviour cloning for the updates that follow.
     pub const fn set_bc_weight(&mut self, weight: f32) {
         self.config.bc_weight = weight;
+    }
+
+    /// Sets whether the updates that follow clone advice only where the critic values it above the actor's own action.
+    pub const fn set_bc_filter(&mut self, filters_advice: bool) {
+        self.filters_advice = filters_advice;
     }
 
     /// Sets how many threads of the rayon pool work on an update, 1 or more. The results are the same, bit for bit.

@@ -31,7 +31,7 @@ pub const ADDED: [(&str, &str); 12] = [
     ("replay.coda_contact_prob", "0.0"),
     ("ddpg.batches_per_update", "1"),
     ("ddpg.bc_final_fraction", "1.0"),
-    ("ddpg.bc_q_filter", "false"),
+    ("ddpg.bc_filter_start", "1.0"),
     ("evaluation.early_points", "0"),
 ];
 

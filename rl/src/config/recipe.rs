@@ -161,7 +161,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         displaced_hindsight: layout.shares_object(),
         displaced_fraction: if tandem { 0.5 } else { 0.0 },
         coda_fraction: if tandem && layout.has_recombinable_arms() { 1.0 } else { 0.0 },
-        coda_contact_prob: if avoids_contacts && layout.describes_contacts() { 0.3 } else { 0.0 },
+        coda_contact_prob: 0.0,
         arm_swap_prob: if tandem && layout.has_interchangeable_arms() { 0.5 } else { 0.0 },
         reflection_prob: if tandem && layout.has_reflection() { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },

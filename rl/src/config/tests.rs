@@ -67,6 +67,22 @@ fn the_cost_of_a_contact_grows_over_the_middle_half_of_a_run() {
 }
 
 #[test]
+fn advice_is_filtered_from_a_fraction_of_a_run_with_a_limit() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 100 * config.env_steps_per_round();
+    let filtered =
+        |config: &RunConfig| (0..100).filter(|round| config.filters_advice(*round)).count();
+    assert_eq!(filtered(&config), 0, "the recipe never filters");
+    config.ddpg.bc_filter_start = 0.25;
+    assert_eq!(filtered(&config), 75);
+    assert!(config.filters_advice(25) && !config.filters_advice(24));
+    config.ddpg.bc_filter_start = 0.0;
+    assert_eq!(filtered(&config), 100);
+    config.stop.max_env_steps = 0;
+    assert_eq!(filtered(&config), 0, "without an end");
+}
+
+#[test]
 fn cloning_fades_over_the_middle_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;

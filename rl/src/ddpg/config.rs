@@ -24,10 +24,11 @@ pub struct DdpgConfig {
     /// to three quarters of `stop.max_env_steps`; a run without that limit keeps it.
     #[serde(default = "all_of_it")]
     pub bc_final_fraction: f32,
-    /// Whether advice is cloned only where the critic values it above the actor's own action: the Q-filter of Nair et al.
-    /// 2018, equation 4. With a value per arm, the advice to an arm is compared by the arm's own value.
-    #[serde(default)]
-    pub bc_q_filter: bool,
+    /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's own
+    /// action, in [0, 1]: the Q-filter of Nair et al. 2018, equation 4. With a value per arm, the advice to an arm is
+    /// compared by the arm's own value. 1 is never; a run without that limit never filters.
+    #[serde(default = "never")]
+    pub bc_filter_start: f32,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It
     /// is Spinning Up's `polyak`, and 1 - `tau` of Stable-Baselines3.
     pub polyak_keep: f32,
@@ -60,7 +61,7 @@ impl Default for DdpgConfig {
             action_penalty: 0.1,
             bc_weight: 2.0,
             bc_final_fraction: all_of_it(),
-            bc_q_filter: false,
+            bc_filter_start: never(),
             polyak_keep: 0.95,
             actor_learning_rate: 1e-3,
             critic_learning_rate: 1e-3,
@@ -79,6 +80,11 @@ const fn one_batch() -> usize {
 }
 
 const fn all_of_it() -> f32 {
+    1.0
+}
+
+/// The start of a filter that never starts.
+const fn never() -> f32 {
     1.0
 }
 
@@ -106,6 +112,7 @@ impl DdpgConfig {
             ("ddpg.polyak_keep", self.polyak_keep),
             ("ddpg.cooldown_share", self.cooldown_share),
             ("ddpg.bc_final_fraction", self.bc_final_fraction),
+            ("ddpg.bc_filter_start", self.bc_filter_start),
         ] {
             let is_fraction = (0.0..=1.0).contains(&fraction);
             OutOfRange::unless(is_fraction, key, fraction, "a number in [0, 1]")?;
