@@ -223,7 +223,8 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
 fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
     let (_keep, out) = run_directory();
     let run = start_with("2", &["--set", "checkpoint.every_rounds=1000"], &out);
-    let is_under_way = || out.join("run.toml").exists();
+    // Workers start once the learner listens.
+    let is_under_way = || !pids(run.id(), "worker").is_empty();
     assert!(eventually(is_under_way));
     kill_one(&run, "learner");
     let ended = finish(run);
