@@ -19,7 +19,7 @@ pub struct WorldConfig {
     pub object_mass_kg: f32,
     /// Largest force of each side of the gripper, newtons, in [0.1, 60].
     pub grip_force_n: f32,
-    /// Coulomb friction coefficient of the table, in [0, 2].
+    /// Coulomb friction coefficient of the table, in [0.01, 2].
     pub table_friction: f32,
     /// Friction in the push task. It is lower than the table's, so a hand pushes objects and cannot drag them from
     /// above.
@@ -78,7 +78,7 @@ impl WorldConfig {
         check("object_half_size_m", self.object_half_size_m.into(), 0.015, 0.045)?;
         check("object_mass_kg", self.object_mass_kg.into(), 0.02, 1.0)?;
         check("grip_force_n", self.grip_force_n.into(), 0.1, 60.0)?;
-        check("table_friction", self.table_friction.into(), 0.0, 2.0)?;
+        check("table_friction", self.table_friction.into(), 0.01, 2.0)?;
         check("push.pads", self.push.pads.into(), 0.0, 2.0)?;
         check("push.object", self.push.object.into(), 0.0, 2.0)?;
         check("pick_and_place.pads", self.pick_and_place.pads.into(), 0.0, 2.0)?;
@@ -205,6 +205,7 @@ mod tests {
             named(WorldConfig { push: Friction { pads: -0.1, object: 0.3 }, ..default() }),
             "push.pads"
         );
+        assert_eq!(named(WorldConfig { table_friction: 0.0, ..default() }), "table_friction");
         let edge = WorldConfig { object_half_size_m: 0.045, object_mass_kg: 0.02, ..default() };
         assert_eq!(edge.clone().checked(), Ok(edge));
     }

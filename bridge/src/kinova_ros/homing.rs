@@ -1,8 +1,8 @@
 //! Homing an arm after power-up, over a connection of its own and without an executor.
 //!
 //! Kinova's node moves the arm to its home position by itself, along an unchecked path, and then opens the gripper
-//! completely. Its one thread serves nothing else meanwhile: it reports no states and **delays `in/stop` until
-//! the arm is home**. Only the emergency stop ends it earlier.
+//! completely. The node has one thread and handles no other request until then: it reports no states and **delays
+//! `in/stop` until the arm is home**. Only the emergency stop ends the motion earlier.
 
 use std::time::Duration;
 

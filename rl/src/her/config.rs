@@ -132,6 +132,10 @@ impl ReplayConfig {
         let recombination = "0 for this task, whose arms cannot be recombined";
         let (key, fraction) = ("replay.coda_fraction", self.coda_fraction);
         let is_usable = fraction == 0.0 || layout.n_arms() != 2 || layout.has_recombinable_arms();
-        OutOfRange::unless(is_usable, key, fraction, recombination)
+        OutOfRange::unless(is_usable, key, fraction, recombination)?;
+        let unknown = "0 for this task, which does not describe when hands are in contact";
+        let (key, prob) = ("replay.coda_contact_prob", self.coda_contact_prob);
+        let is_usable = prob == 0.0 || layout.n_arms() != 2 || layout.describes_contacts();
+        OutOfRange::unless(is_usable, key, prob, unknown)
     }
 }
