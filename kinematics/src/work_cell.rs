@@ -56,8 +56,13 @@ impl WorkCell {
     /// Returns two Micos with four joints that face each other, the centres of their workspaces 0.24 m apart.
     #[must_use]
     pub fn mico_pair() -> Self {
+        Self::mico_pair_with(TaskFrame::MICO_4)
+    }
+
+    /// As [`mico_pair`](Self::mico_pair), with the own frames at `task_frame` in the bases.
+    #[must_use]
+    pub fn mico_pair_with(task_frame: TaskFrame) -> Self {
         let centres_apart_m = f64::from(WORKSPACE_DISTANCE_M);
-        let task_frame = TaskFrame::MICO_4;
         let x_m = 0.5 * centres_apart_m + task_frame.centre_m;
         let arm = |x_m, yaw_rad| PlacedArm {
             model: &MICO_4,

@@ -41,6 +41,9 @@ pub struct Policy {
 /// The metadata entry of a policy without a critic, whose values are all 0, such as an actor from another program.
 pub const NO_CRITIC: (&str, &str) = ("critic", "none");
 
+/// The metadata entry of a policy whose training episodes differed in their worlds: how much, in (0, 1].
+pub const RANDOMIZATION_KEY: &str = "randomization";
+
 /// One named array of a policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor<'a> {

@@ -24,6 +24,7 @@ use crate::link_avoidance as damper;
 use crate::parameters::WorldParameters;
 pub use crate::physics::Part;
 use crate::physics::{GRAVITY, owner};
+use crate::reach::Reach;
 use crate::world::World;
 
 /// A world as data.
@@ -148,6 +149,9 @@ pub struct HandControl {
     pub workspace_low_m: [f32; 3],
     /// Upper corner of this workspace, arm frame, metres.
     pub workspace_high_m: [f32; 3],
+    /// The part of this workspace that the arm reaches; all of it if there is none. Targets outside are moved along their
+    /// radius.
+    pub reach: Option<&'static Reach>,
     /// Gain from the palm's distance to its target to its velocity, 1/s.
     pub approach_gain_per_s: f32,
     /// Largest speed of the palm, metres per second, if it is limited.
@@ -351,6 +355,7 @@ fn hand_control(config: &WorldConfig, parameters: &WorldParameters) -> HandContr
         action_m: ACTION_M,
         workspace_low_m: parameters.workspace_low.to_array(),
         workspace_high_m: parameters.workspace_high.to_array(),
+        reach: parameters.reach,
         approach_gain_per_s: parameters.approach_gain_per_s,
         max_speed_mps: parameters.max_speed_mps,
         mass_kg: PALM_MASS_KG + FINGERS_MASS_KG,

@@ -5,10 +5,11 @@
 //! tests with the arm's kinematics.
 
 use rapier3d::math::Vector;
+use serde::Serialize;
 use tandem_core::World;
 
 /// Radii about the vertical axis through an arm's base that the arm reaches at each height.
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Serialize)]
 pub struct Reach {
     /// Position of the axis along x, arm frame, metres.
     axis_x_m: f32,
@@ -16,7 +17,7 @@ pub struct Reach {
 }
 
 /// Smallest and largest radius at a height of the end effector above the table, metres.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 struct Ring {
     height_m: f32,
     radii_m: [f32; 2],
@@ -61,7 +62,8 @@ impl Reach {
     }
 
     /// Moves a point (arm frame, metres) along its radius to the nearest one in reach.
-    pub(crate) fn clamp(&self, point: Vector) -> Vector {
+    #[must_use]
+    pub fn clamp(&self, point: Vector) -> Vector {
         let radius_m = self.radius_m(point.to_array());
         let [low_m, high_m] = self.radii_m(point.z);
         if (low_m..=high_m).contains(&radius_m) {

@@ -7,10 +7,12 @@ use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
 use tandem_core::text::counted;
 use tandem_core::{Layout, Task};
+use tandem_policy::policy::RANDOMIZATION_KEY;
 use tandem_report::{Comparison, PlottedTrials, report_html};
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
 use tandem_trials::simulated::Block;
+use tandem_trials::trial::mapping::TRAINED_HALF_M;
 use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
 use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
 
@@ -56,6 +58,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 layout: Layout::new(task, 2),
                 mode: mode_of(*mode),
                 block,
+                trained_half_m: trained_half_m(policy, &block),
                 seed: args.seed,
                 speed: args.speed,
                 simulated: SimulatedConfig::default(),
@@ -71,6 +74,12 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
         }
     }
     show(args, all, &file)
+}
+
+/// Returns half the edge of the blocks that `policy` was trained with, metres. Where sizes varied it knows those of `block`.
+fn trained_half_m(policy: &NamedPolicy, block: &Block) -> f64 {
+    let is_varied = policy.policy.metadata.contains_key(RANDOMIZATION_KEY);
+    if is_varied { f64::from(block.half_m) } else { TRAINED_HALF_M }
 }
 
 const fn mode_of(name: ModeName) -> TrialMode {

@@ -297,7 +297,7 @@ impl Driver for SimulatedPair {
 }
 
 /// Rounds to single precision.
-fn single(number: f64) -> f32 {
+pub(crate) fn single(number: f64) -> f32 {
     DVec3::splat(number).as_vec3().x
 }
 

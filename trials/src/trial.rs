@@ -32,6 +32,8 @@ pub mod rehearsal;
 
 mod block_avoidance;
 mod closed_loop;
+mod coordination;
+mod open_loop;
 mod rig;
 mod runner;
 mod shared_object;
@@ -83,6 +85,9 @@ pub struct TrialConfig {
     pub mode: TrialMode,
     /// The size and mass of the blocks. Their positions are drawn.
     pub block: Block,
+    /// Half the edge of the blocks that the policy was trained with, metres: [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M),
+    /// or that of `block` if their sizes varied. The policy perceives blocks and openings as those of such a block.
+    pub trained_half_m: f64,
     /// The seed of starts, goals, latencies and noise.
     pub seed: u64,
     /// The share of the highest speed, in (0, 1].

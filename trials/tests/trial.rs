@@ -7,9 +7,10 @@ use tandem_core::{Contacts, Layout, Task};
 use tandem_policy::{Actor, Policy};
 use tandem_trials::SimulatedConfig;
 use tandem_trials::simulated::Block;
+use tandem_trials::trial::mapping::TRAINED_HALF_M;
 use tandem_trials::trial::{
-    Frame, NoObserver, ObjectPositions, TrialConfig, TrialMode, TrialObserver, TrialReport,
-    TrialRunner,
+    Frame, NoObserver, ObjectPositions, Rehearsal, TrialConfig, TrialMode, TrialObserver,
+    TrialReport, TrialRunner,
 };
 
 fn shipped(name: &str) -> Actor {
@@ -18,16 +19,20 @@ fn shipped(name: &str) -> Actor {
 }
 
 fn trials(task: Task, mode: TrialMode, seed: u64) -> TrialRunner {
-    let config = TrialConfig {
+    TrialRunner::new(config(task, mode, seed)).unwrap()
+}
+
+fn config(task: Task, mode: TrialMode, seed: u64) -> TrialConfig {
+    TrialConfig {
         layout: Layout::new(task, 2),
         mode,
         block: Block::small([0.0; 2]),
+        trained_half_m: TRAINED_HALF_M,
         seed,
         speed: 1.0,
         simulated: SimulatedConfig::default(),
         time_limit_s: 120.0,
-    };
-    TrialRunner::new(config).unwrap()
+    }
 }
 
 fn run(trials: &mut TrialRunner, number: u64, actor: &mut Actor) -> TrialReport {
@@ -141,4 +146,72 @@ fn an_idle_policy_does_not_reach_its_goals_and_is_observed() {
             assert!((object.end - object.start).length() < 1e-3, "no contact moved it");
         }
     }
+}
+
+#[test]
+fn arms_reach_every_start_of_the_shared_world() {
+    for task in Task::SHARED {
+        let config = TrialConfig { time_limit_s: 0.3, ..config(task, TrialMode::ClosedLoop, 3) };
+        let mut trials = TrialRunner::new(config).unwrap();
+        let mut idle = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.0);
+        for number in 0..100 {
+            let report = trials.run(number, &mut idle, &mut NoObserver).unwrap();
+            let cause = report.cause.map(|cause| cause.name());
+            assert_eq!(cause, Some("timed-out"), "{task}, trial {number}");
+        }
+    }
+}
+
+#[test]
+fn a_policy_perceives_the_rotation_and_the_size_that_it_was_trained_with() {
+    let block = Block::small([0.0; 2]);
+    let half_m = f64::from(block.half_m);
+    for (trained_half_m, expected_m) in [(TRAINED_HALF_M, TRAINED_HALF_M), (half_m, half_m)] {
+        let config = TrialConfig {
+            trained_half_m,
+            block,
+            time_limit_s: 0.3,
+            ..config(Task::SharedPush, TrialMode::ClosedLoop, 1)
+        };
+        let start = Rehearsal::new(config.layout, &block, trained_half_m)
+            .unwrap()
+            .start(config.seed, 0, |_| true)
+            .unwrap();
+        assert!(start.yaws_rad.iter().all(|yaw_rad| (0.01..0.79).contains(&yaw_rad.abs())));
+        let mut seen = Vec::new();
+        let mut look = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+            seen.push((observation.to_vec(), goal.to_vec()));
+            action.fill(0.0);
+        };
+        TrialRunner::new(config).unwrap().run(0, &mut look, &mut NoObserver).unwrap();
+        let (observation, goal) = &seen[0];
+        for arm in 0..2 {
+            // Cameras are not exact.
+            let height_m = f64::from(observation[28 * arm + 5]);
+            assert!((height_m - expected_m).abs() < 0.005, "{height_m} m");
+            assert!((f64::from(goal[3 * arm + 2]) - expected_m).abs() < 1e-6);
+            let yaw_rad = 2.0 * f64::from(observation[28 * arm + 14]).asin();
+            assert!((yaw_rad - start.yaws_rad[arm]).abs() < 0.05, "{yaw_rad} rad");
+        }
+    }
+}
+
+#[test]
+fn arms_that_are_in_each_others_way_do_not_touch_and_keep_their_steps() {
+    // Both arms want to be where the other one is.
+    let config =
+        TrialConfig { time_limit_s: 30.0, ..config(Task::SharedPush, TrialMode::ClosedLoop, 1) };
+    let mut ahead = |observation: &[f32], _: &[f32], action: &mut [f32]| {
+        for arm in 0..2 {
+            let hand = &observation[28 * arm..28 * arm + 3];
+            let wanted = [0.15, 0.0, 0.15];
+            for axis in 0..3 {
+                action[3 * arm + axis] = ((wanted[axis] - hand[axis]) / 0.05).clamp(-1.0, 1.0);
+            }
+        }
+    };
+    let report = TrialRunner::new(config).unwrap().run(0, &mut ahead, &mut NoObserver).unwrap();
+    assert_eq!(report.touched, Contacts::NONE);
+    assert!(report.arms_gap_m > 0.012, "{} m", report.arms_gap_m);
+    assert!(report.n_shortened > 0 && report.n_steps > 50, "{report:?}");
 }

@@ -48,8 +48,9 @@ impl<A> PerturbedActor<A> {
         for arm in layout.arms() {
             let angle = uniform(&mut rng, -std::f32::consts::PI, std::f32::consts::PI);
             let offset = &mut offsets[layout.goal_of(arm)];
-            offset[0] = perturbation.base_offset_m * angle.cos();
-            offset[1] = perturbation.base_offset_m * angle.sin();
+            let (sin, cos) = libm::sincosf(angle);
+            offset[0] = perturbation.base_offset_m * cos;
+            offset[1] = perturbation.base_offset_m * sin;
         }
         let pending = vec![vec![0.0; layout.n_action()]; perturbation.delay_steps];
         Self { actor, layout, perturbation, rng, offsets, pending }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary};
 use tandem_policy::Policy;
+use tandem_policy::policy::RANDOMIZATION_KEY;
 use tandem_rl::config::Recipe;
 use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::EvaluationFinished;
@@ -142,9 +143,13 @@ impl<'a> Evaluations<'a> {
         let without_contact = row.contacts.success_without_contact;
         let without_contact =
             without_contact.map(|share| ("evaluation_success_without_contact", share.to_string()));
+        let randomization = run.world.randomization;
+        let randomization =
+            (randomization > 0.0).then(|| (RANDOMIZATION_KEY, randomization.to_string()));
         entries
             .into_iter()
             .chain(without_contact)
+            .chain(randomization)
             .map(|(key, value)| (key.to_owned(), value))
             .collect()
     }

@@ -3,7 +3,9 @@
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
 use tandem_core::scene::Cuboid;
-use tandem_kinematics::{ArmWaypoint, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell};
+use tandem_kinematics::{
+    ArmWaypoint, CheckSettings, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell,
+};
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose, SharedObject};
 use crate::trial::ActionSource;
@@ -12,7 +14,7 @@ use crate::trial::mapping::ArmObservation;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{TrialRig, tool_positions};
-use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
+use crate::trial::runner::{REST_S, TrialExecution, TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 /// A policy is done after this many consecutive observations in which every object was within this share of the
@@ -24,6 +26,15 @@ const STILL_M: f64 = 5e-4;
 const STILL_OPENING: f64 = 0.005;
 /// The displacement of an arm that makes room, own frame, metres.
 const BACK_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
+
+/// The displacements of an arm that stays or withdraws from the other one, own frame, metres.
+const APART_M: [DVec3; 5] = [
+    DVec3::ZERO,
+    DVec3::new(-0.04, 0.0, 0.02),
+    DVec3::new(0.0, 0.0, 0.05),
+    DVec3::new(0.0, -0.04, 0.03),
+    DVec3::new(0.0, 0.04, 0.03),
+];
 
 /// The part of a step that an arm carries out.
 #[derive(Clone, Copy)]
@@ -51,6 +62,15 @@ const ATTEMPTS: [[StepPart; 2]; 10] = {
         [Back, Back],
     ]
 };
+
+/// What the policy wants in a step, and what is in the way.
+struct WantedStep<'a> {
+    /// The end effectors after the step, own frames, metres.
+    hands: Vec<DVec3>,
+    /// The openings after the step, metres on each side.
+    openings_m: Vec<f64>,
+    blocks: &'a [ObservedBlock],
+}
 
 /// The state of the closed loop.
 struct LoopState {
@@ -89,18 +109,12 @@ impl TrialRunner {
             n_in_success: 0,
             waypoints: Vec::new(),
         };
-        let mut state = LoopState {
-            at: at.to_vec(),
-            openings_m: vec![start.opening_m; at.len()],
-            velocities: vec![DVec3::ZERO; at.len()],
-            before: None,
-            n_done: 0,
-            n_in_success: 0,
-            carries: false,
-            waypoints: Vec::new(),
-        };
+        let mut state = LoopState::new(start, at);
         let time_limit_s = self.config.time_limit_s / self.config.speed;
-        while execution.n_steps < self.task.episode_steps() && state.n_done < DONE_OBSERVATIONS {
+        // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
+        while execution.n_steps - execution.n_shortened < self.task.episode_steps()
+            && state.n_done < DONE_OBSERVATIONS
+        {
             if rig.now_s() > time_limit_s {
                 execution.timed_out = true;
                 break;
@@ -158,17 +172,18 @@ impl TrialRunner {
             && layout.arms().any(|arm| self.task.arm_holds(arm, &observation));
         let mut action = vec![0.0; layout.n_action()];
         policy.act(&observation, &goal, &mut action);
-        let mut wanted: Vec<(DVec3, f64)> = Vec::new();
+        let blocks = self.observed_blocks(&objects, start.shared.as_ref());
+        let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
             let opening_m = self.mapping.opening_after(state.openings_m[arm.0], action);
             let velocity = &mut state.velocities[arm.0];
             let (hand, then) = self.mapping.hand_after(now[arm.0].hand, *velocity, action);
             *velocity = then;
-            wanted.push((hand, opening_m));
+            wanted.hands.push(hand);
+            wanted.openings_m.push(opening_m);
         }
-        let blocks = self.observed_blocks(&objects, start.shared.as_ref());
-        self.move_hands(rig, state, &wanted, &blocks)
+        self.move_hands(rig, state, &wanted)
     }
 
     /// Returns the blocks at the observed poses; of a shared object, its parts by the poses of the arms' points.
@@ -205,68 +220,112 @@ impl TrialRunner {
         shared.shown.iter().map(block).collect()
     }
 
-    /// Moves the hands to the `wanted` positions, or as far as the check allows. Returns whether they arrived.
+    /// Moves the hands to the wanted positions, or as far as the check allows. Returns whether they arrived.
     fn move_hands(
         &self,
         rig: &mut TrialRig<'_>,
         state: &mut LoopState,
-        wanted: &[(DVec3, f64)],
-        blocks: &[ObservedBlock],
+        wanted: &WantedStep<'_>,
     ) -> Result<bool, FailureCause> {
-        let cell = self.mapping.cell();
-        let from: Vec<DVec3> = (0..wanted.len())
-            .map(|arm| self.mapping.hand_in_own(ArmIndex(arm), &state.at[arm]))
-            .collect();
-        let openings = |openings_m: &[f64]| -> Vec<f64> {
-            openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m)).collect()
-        };
-        let here = tool_positions(cell, &state.at);
-        let first: Waypoint = here
-            .iter()
-            .zip(openings(&state.openings_m))
-            .map(|(tool, opening)| ArmWaypoint {
-                tool_in_world_m: (*tool).into(),
-                gripper_opening: opening,
-            })
-            .collect();
-        let openings_m: Vec<f64> = wanted.iter().map(|(_, opening_m)| *opening_m).collect();
+        let from = self.hands(state);
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
             if state.carries && !is_joint(parts) {
                 continue;
             }
-            let mut to: Vec<DVec3> = (0..wanted.len())
+            let mut to: Vec<DVec3> = (0..from.len())
                 .map(|arm| match parts[arm] {
-                    StepPart::Share(share) => from[arm].lerp(wanted[arm].0, share),
+                    StepPart::Share(share) => from[arm].lerp(wanted.hands[arm], share),
                     StepPart::Back => from[arm] + BACK_M,
                 })
                 .collect();
             if state.carries {
                 self.keep_hands_apart(&from, &mut to);
             }
-            let Ok([corner, end, last]) =
-                self.step_waypoints(&from, &to, &openings_m, state, blocks)
-            else {
-                continue;
-            };
-            if is_still(&first, &corner) && is_still(&first, &last) {
-                state.openings_m = openings_m;
-                return Ok(attempt == 0);
-            }
-            let waypoints = [first.clone(), corner, end, last];
             let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
-            let Ok(motion) = self.motion(&waypoints, &state.at, check) else { continue };
-            let ends: Vec<Joints> =
-                motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-            match rig.play(motion, self.config.speed) {
-                Err(FailureCause::Refused(_)) => continue,
-                played => played?,
+            if self.attempt(rig, state, wanted, &to, check)? {
+                return Ok(attempt == 0);
             }
-            state.append_waypoints(waypoints);
-            (state.at, state.openings_m) = (ends, openings_m);
-            return Ok(attempt == 0);
+        }
+        if !state.carries {
+            for to in self.ways_apart(&from, state) {
+                if self.attempt(rig, state, wanted, &to, &self.check)? {
+                    break;
+                }
+            }
         }
         Ok(false)
+    }
+
+    /// Moves the hands `to` (own frames, metres) if `check` allows it. Returns whether it does, also if the hands are there.
+    fn attempt(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+        wanted: &WantedStep<'_>,
+        to: &[DVec3],
+        check: &CheckSettings,
+    ) -> Result<bool, FailureCause> {
+        let openings = state.openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m));
+        let first: Waypoint = tool_positions(self.mapping.cell(), &state.at)
+            .iter()
+            .zip(openings)
+            .map(|(tool, opening)| ArmWaypoint {
+                tool_in_world_m: (*tool).into(),
+                gripper_opening: opening,
+            })
+            .collect();
+        let Ok([corner, end, last]) = self.step_waypoints(to, state, wanted) else {
+            return Ok(false);
+        };
+        if is_still(&first, &corner) && is_still(&first, &last) {
+            state.openings_m.clone_from(&wanted.openings_m);
+            return Ok(true);
+        }
+        let waypoints = [first, corner, end, last];
+        let Ok(motion) = self.motion(&waypoints, &state.at, check) else { return Ok(false) };
+        let ends: Vec<Joints> =
+            motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
+        match rig.play(motion, self.config.speed) {
+            Err(FailureCause::Refused(_)) => return Ok(false),
+            played => played?,
+        }
+        state.append_waypoints(waypoints);
+        state.at = ends;
+        state.openings_m.clone_from(&wanted.openings_m);
+        Ok(true)
+    }
+
+    /// The end effectors at the commanded angles, own frames, metres.
+    fn hands(&self, state: &LoopState) -> Vec<DVec3> {
+        let arms = state.at.iter().enumerate();
+        arms.map(|(arm, at)| self.mapping.hand_in_own(ArmIndex(arm), at)).collect()
+    }
+
+    /// Returns the positions of the hands (own frames, metres) in which two arms are farther apart than `from`, farthest
+    /// first.
+    fn ways_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
+        let gap_m = |hands: &[DVec3]| {
+            let reached = hands.iter().zip(&state.at).enumerate().map(|(arm, (hand, near))| {
+                self.mapping.tool_in_world(ArmIndex(arm), *hand, near).map(|(_, angles)| angles)
+            });
+            let angles: Result<Vec<Joints>, ReachError> = reached.collect();
+            angles.map_or(f64::NEG_INFINITY, |angles| self.mapping.cell().gaps(&angles).arms_m)
+        };
+        let [first, second] = from else { return Vec::new() };
+        let now_m = gap_m(from);
+        let mut ways: Vec<(f64, Vec<DVec3>)> = Vec::new();
+        for one in APART_M {
+            for other in APART_M {
+                let to = vec![*first + one, *second + other];
+                let to_m = gap_m(&to);
+                if to_m > now_m {
+                    ways.push((to_m, to));
+                }
+            }
+        }
+        ways.sort_by(|(one_m, _), (other_m, _)| other_m.total_cmp(one_m));
+        ways.into_iter().map(|(_, to)| to).collect()
     }
 
     /// Moves the end effectors `to` so that they are as far apart as `from`; own frames, metres.
@@ -282,24 +341,27 @@ impl TrialRunner {
         }
     }
 
-    /// Returns the waypoints of the tools for end effectors that move from `from` to `to` (own frames, metres): a
-    /// corner, the end, and the end again with closed grippers. A gripper that closed while it moves would drag its
-    /// object along.
+    /// Returns the waypoints of the tools for end effectors that move `to` (own frames, metres): a corner, the end, and the
+    /// end again with closed grippers. A gripper that closed while it moves would drag its object along.
     fn step_waypoints(
         &self,
-        from: &[DVec3],
         to: &[DVec3],
-        openings_m: &[f64],
         state: &LoopState,
-        blocks: &[ObservedBlock],
-    ) -> Result<[Waypoint; 3], ReachError> {
+        wanted: &WantedStep<'_>,
+    ) -> Result<[Waypoint; 3], FailureCause> {
+        let WantedStep { openings_m, blocks, .. } = wanted;
+        let from = self.hands(state);
         let mut step: [Waypoint; 3] = Default::default();
         for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
             let (idx, near) = (ArmIndex(arm), &state.at[arm]);
             let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
-            let [from, to] = [from, to].map(|own| self.mapping.pads_in_world(idx, own[arm]));
-            let (_, then) = self.mapping.tool_for_pads(idx, to, near)?;
+            let [from, to] = [from[arm], to[arm]].map(|own| self.mapping.pads_in_world(idx, own));
+            let tool = |pads| {
+                let tool = self.mapping.tool_for_pads(idx, pads, near);
+                tool.map_err(|source| unreachable(idx, source))
+            };
+            let (_, then) = tool(to)?;
             let tilt_rad = |angles| ForwardKinematics::new(placed.model, angles).tilt_rad();
             let pads = Pads {
                 yaw_rad: placed.yaw_rad + WorkCell::FINGERS_YAW_RAD,
@@ -319,7 +381,7 @@ impl TrialRunner {
             };
             let points = [corner, end, end];
             for ((waypoint, point), opening) in step.iter_mut().zip(points).zip(openings) {
-                let (tool_in_world_m, _) = self.mapping.tool_for_pads(idx, point, near)?;
+                let (tool_in_world_m, _) = tool(point)?;
                 waypoint.push(ArmWaypoint {
                     tool_in_world_m: tool_in_world_m.into(),
                     gripper_opening: opening,
@@ -331,6 +393,20 @@ impl TrialRunner {
 }
 
 impl LoopState {
+    /// The state at the start of a trial, at joint angles `at`, radians.
+    fn new(start: &TrialStart, at: &[Joints]) -> Self {
+        Self {
+            at: at.to_vec(),
+            openings_m: vec![start.opening_m; at.len()],
+            velocities: vec![DVec3::ZERO; at.len()],
+            before: None,
+            n_done: 0,
+            n_in_success: 0,
+            carries: false,
+            waypoints: Vec::new(),
+        }
+    }
+
     /// Appends a step's waypoints. The first one is the previous position of the tools.
     fn append_waypoints(&mut self, step: [Waypoint; 4]) {
         let n_known = usize::from(!self.waypoints.is_empty());

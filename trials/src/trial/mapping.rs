@@ -1,17 +1,18 @@
 //! The mapping between the policy's observations and actions and the real table.
 //!
 //! **Positions.** Lengths are not scaled. The policy's end effector is the point between the pads. The tool's origin is
-//! [`PADS_AHEAD_M`] behind it along the tilted gripper, and [`HAND_LIFT_M`] higher than in the training world, because
-//! the real fingers extend beyond their pads. Objects and goals keep their positions; heights are measured from a block
-//! that rests on the table, so blocks of any size start at the height that the policy knows.
+//! [`PADS_AHEAD_M`] behind it along the tilted gripper, and higher than in the training world if its hand can be lower
+//! than [`PADS_LOWEST_M`], because the real fingers extend beyond their pads. Objects and goals keep their positions.
+//! Heights are measured from a block that rests on the table, so blocks of any size start at the height that the policy
+//! knows.
 //!
 //! **Time.** The arms are slower than the training world's hands, and a step takes as long as the arms need. The policy
 //! expects a hand with inertia, so the training world's servo continues its hand ([`Mapping::hand_after`]): the arm
 //! moves to the position of that hand after the step, and the policy observes its velocity. Objects have the hand's
 //! velocity to the extent that they moved with it.
 //!
-//! **Openings.** The policy knows a gripper that opens by [`OPENING_M`] on each side and blocks of one size. Three
-//! openings correspond: closed, open, and just touching the block. Openings in between are interpolated linearly.
+//! **Openings.** The policy knows the training world's gripper and blocks of one size. Three openings correspond: closed,
+//! open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout};
@@ -22,17 +23,12 @@ use crate::trial::training_hand::TrainingHand;
 
 /// The distance from the tool's origin to the point between the pads, metres.
 pub const PADS_AHEAD_M: f64 = 0.021;
-/// The height of the point between the pads above the policy's end effector, metres.
-pub const HAND_LIFT_M: f64 = 0.009;
+/// The smallest height of the point between the pads above the table, metres.
+pub const PADS_LOWEST_M: f64 = 0.031;
 /// The gap between an arm's parts and the table that hands keep, metres; more than the check requires.
 pub const TABLE_GAP_M: f64 = 0.006;
-/// The largest opening of each side of the training world's gripper, metres.
-pub const OPENING_M: f64 = 0.040;
-/// Half the edge of the training world's blocks, metres.
+/// Half the edge of the training world's blocks unless their sizes vary, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
-/// The velocity at the end of a step per displacement in it, for objects that move by themselves: the remaining
-/// distance times the servo's gain.
-const END_VELOCITY_SHARE: f64 = 0.556;
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
@@ -44,7 +40,11 @@ pub struct Mapping {
     alone: Vec<WorkCell>,
     layout: Layout,
     hand: TrainingHand,
+    /// The height of the point between the pads above the policy's end effector, metres.
+    hand_lift_m: f64,
     block_half_m: f64,
+    /// Half the edge of the blocks that the policy knows, metres.
+    trained_half_m: f64,
 }
 
 /// One arm and its object at one time, in the policy's terms.
@@ -64,14 +64,22 @@ pub struct ArmObservation {
 
 impl Mapping {
     /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A shared
-    /// object counts as blocks of its width.
+    /// object counts as blocks of its width. The policy knows blocks with half an edge of `trained_half_m` metres.
     #[must_use]
-    pub fn new(cell: WorkCell, layout: Layout, hand: TrainingHand, block: &Block) -> Self {
+    pub fn new(
+        cell: WorkCell,
+        layout: Layout,
+        hand: TrainingHand,
+        block: &Block,
+        trained_half_m: f64,
+    ) -> Self {
         let task_frame = TaskFrame { scale: 1.0, lift_m: 0.0, ..cell.task_frame };
         let cell = WorkCell { task_frame, ..cell };
         let alone = |arm: &PlacedArm| WorkCell { arms: vec![*arm], ..cell.clone() };
         let alone = cell.arms.iter().map(alone).collect();
-        Self { cell, alone, layout, hand, block_half_m: f64::from(block.half_m) }
+        let hand_lift_m = 1e-6 * ((PADS_LOWEST_M - hand.lowest_m()) * 1e6).round();
+        let block_half_m = f64::from(block.half_m);
+        Self { cell, alone, layout, hand, hand_lift_m, block_half_m, trained_half_m }
     }
 
     /// The work cell, with the table as the origin of heights.
@@ -83,14 +91,14 @@ impl Mapping {
     /// Converts the position of an object or goal from the own frame of `arm` to the world frame, metres.
     #[must_use]
     pub fn object_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        let own = own + DVec3::Z * (self.block_half_m - TRAINED_HALF_M);
+        let own = own + DVec3::Z * (self.block_half_m - self.trained_half_m);
         self.cell.world_from_own(arm, &own.into()).into()
     }
 
     /// Converts the position of an object or goal from the world frame to the own frame of `arm`, metres.
     #[must_use]
     pub fn object_in_own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        self.own(arm, in_world) - DVec3::Z * (self.block_half_m - TRAINED_HALF_M)
+        self.own(arm, in_world) - DVec3::Z * (self.block_half_m - self.trained_half_m)
     }
 
     /// Returns the tool's origin (world frame, metres) for the policy's end effector at `own` (own frame, metres), and
@@ -112,13 +120,13 @@ impl Mapping {
     /// metres: the inverse of [`pads_in_world`](Self::pads_in_world).
     #[must_use]
     pub fn hand_of_pads(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        self.own(arm, in_world) - DVec3::Z * HAND_LIFT_M
+        self.own(arm, in_world) - DVec3::Z * self.hand_lift_m
     }
 
     /// Converts an end effector at `own` (own frame of `arm`) to the point between the pads, world frame, metres.
     #[must_use]
     pub fn pads_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, &(own + DVec3::Z * HAND_LIFT_M).into()).into()
+        self.cell.world_from_own(arm, &(own + DVec3::Z * self.hand_lift_m).into()).into()
     }
 
     /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world frame, metres.
@@ -157,10 +165,11 @@ impl Mapping {
     #[must_use]
     pub fn opening(&self, opening_m: f64) -> f64 {
         let touching = self.block_half_m / f64::from(MAX_OPENING_M);
-        if opening_m < TRAINED_HALF_M {
-            (touching * opening_m / TRAINED_HALF_M).max(0.0)
+        if opening_m < self.trained_half_m {
+            (touching * opening_m / self.trained_half_m).max(0.0)
         } else {
-            let beyond = (opening_m - TRAINED_HALF_M) / (OPENING_M - TRAINED_HALF_M);
+            let most_m = self.hand.max_opening_m();
+            let beyond = (opening_m - self.trained_half_m) / (most_m - self.trained_half_m);
             (touching + (1.0 - touching) * beyond).min(1.0)
         }
     }
@@ -170,10 +179,11 @@ impl Mapping {
     pub fn opening_in_own(&self, opening: f64) -> f64 {
         let touching = self.block_half_m / f64::from(MAX_OPENING_M);
         if opening < touching {
-            (TRAINED_HALF_M * opening / touching).max(0.0)
+            (self.trained_half_m * opening / touching).max(0.0)
         } else {
             let beyond = (opening - touching) / (1.0 - touching);
-            (TRAINED_HALF_M + (OPENING_M - TRAINED_HALF_M) * beyond).min(OPENING_M)
+            let most_m = self.hand.max_opening_m();
+            (self.trained_half_m + (most_m - self.trained_half_m) * beyond).min(most_m)
         }
     }
 
@@ -213,7 +223,7 @@ impl Mapping {
             return 0.0;
         }
         let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * self.hand.opening_step_m();
-        (opening_m + step_m).clamp(0.0, OPENING_M)
+        (opening_m + step_m).clamp(0.0, self.hand.max_opening_m())
     }
 
     /// Writes the policy's observation of one arm, shape `[28]`, in the training world's format. Velocities follow from
@@ -224,7 +234,7 @@ impl Mapping {
         before: &ArmObservation,
         observation: &mut [f32],
     ) {
-        write_observation(self.hand.control_step_s(), now, before, observation);
+        write_observation(&self.hand, now, before, observation);
     }
 
     fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
@@ -234,22 +244,23 @@ impl Mapping {
     }
 }
 
-/// As [`Mapping::write_observation`], for control steps of `control_step_s` seconds.
+/// As [`Mapping::write_observation`], for a training world with `hand`.
 fn write_observation(
-    control_step_s: f64,
+    hand: &TrainingHand,
     now: &ArmObservation,
     before: &ArmObservation,
     observation: &mut [f32],
 ) {
-    let hand_velocity = now.hand_velocity * control_step_s;
+    let hand_velocity = now.hand_velocity * hand.control_step_s();
+    let end_velocity_share = hand.end_velocity_share();
     let (hand_way, object_way) = (now.hand - before.hand, now.object - before.object);
     let together = object_way.dot(hand_way) / hand_way.length_squared().max(1e-6);
     let together = together.clamp(0.0, 1.0);
     let object_velocity =
-        hand_velocity * together + (object_way - hand_way * together) * END_VELOCITY_SHARE;
+        hand_velocity * together + (object_way - hand_way * together) * end_velocity_share;
     let turn = (now.turn * before.turn.inverse()).normalize();
     let turn = if turn.w < 0.0 { -turn } else { turn };
-    let turn_velocity = turn.to_scaled_axis() * END_VELOCITY_SHARE;
+    let turn_velocity = turn.to_scaled_axis() * end_velocity_share;
     let opening_rate_m = now.opening_m - before.opening_m;
     let facing = if now.turn.w < 0.0 { -now.turn } else { now.turn };
     let parts = [

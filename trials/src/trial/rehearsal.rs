@@ -5,7 +5,6 @@ use tandem_core::{ArmIndex, Contacts, Layout, Stream, TaskSpec, WorldSettings, e
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::{Block, SharedObject};
-use crate::trial::mapping::{OPENING_M, TRAINED_HALF_M};
 use crate::trial::shared_object::shared_object;
 use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
@@ -24,6 +23,8 @@ pub struct TrialStart {
     pub opening_m: f64,
     /// The objects, arm by arm. Heights are those of the training world's blocks.
     pub objects: Vec<DVec3>,
+    /// The rotations of the objects about the vertical axis, arm by arm, radians.
+    pub yaws_rad: Vec<f64>,
     /// The goals, arm by arm, with the same heights.
     pub goals: Vec<DVec3>,
     /// The object that all arms share, in the training world, if there is one. `objects` are then the arms' points of it.
@@ -57,15 +58,17 @@ pub struct Rehearsal {
     /// The number of control steps of an episode.
     n_steps: usize,
     half_m: f64,
+    /// Half the edge of the blocks whose heights positions have, metres.
+    trained_half_m: f64,
 }
 
 impl Rehearsal {
     /// Creates the world of `layout` with blocks of the size and mass of `block`. An object that all arms share keeps its
-    /// own.
+    /// own. Heights of objects and goals are those of blocks with half an edge of `trained_half_m` metres.
     ///
     /// # Errors
     /// Returns an error if there is no such world.
-    pub fn new(layout: Layout, block: &Block) -> Result<Self, SimError> {
+    pub fn new(layout: Layout, block: &Block, trained_half_m: f64) -> Result<Self, SimError> {
         let world = WorldConfig {
             object_half_size_m: block.half_m,
             object_mass_kg: block.mass_kg,
@@ -76,6 +79,7 @@ impl Rehearsal {
             layout,
             n_steps: TaskSpec::from(layout).episode_steps(),
             half_m: f64::from(block.half_m),
+            trained_half_m,
         };
         if let Some(shared) = rehearsal.shared_object() {
             rehearsal.half_m = f64::from(shared.grasped_half_m());
@@ -97,17 +101,22 @@ impl Rehearsal {
             .then(|| shared_object(&self.env.description(), &self.env.scene().objects))
     }
 
-    /// Draws the start of trial `number` of `seed` as the training world does, with room between blocks. A shared object
-    /// lies where the training world puts it.
+    /// Draws the start of trial `number` of `seed` as the training world does, with room between blocks and such that
+    /// `is_free` accepts it. A shared object lies where the training world puts it.
     ///
     /// # Errors
     /// Returns an error if no start has room for the blocks.
-    pub fn start(&mut self, seed: u64, number: u64) -> Result<TrialStart, TrialError> {
+    pub fn start(
+        &mut self,
+        seed: u64,
+        number: u64,
+        is_free: impl Fn(&TrialStart) -> bool,
+    ) -> Result<TrialStart, TrialError> {
         let mut rng = episode_rng(seed, number, Stream::Reset);
         for _ in 0..N_DRAWS {
             self.env.reset(&mut rng, WorldSettings::default());
             let start = self.current_start();
-            if self.has_room(&start) {
+            if self.has_room(&start) && is_free(&start) {
                 return Ok(start);
             }
         }
@@ -129,7 +138,8 @@ impl Rehearsal {
             policy.act(&observation, &goal, &mut action);
             contacts = contacts | self.env.step(&action)?;
             self.env.observe(&mut observation);
-            steps.push(RolloutStep { hands: self.points(&observation, 0), action });
+            let hands = self.points(&observation, 0);
+            steps.push(RolloutStep { hands, action });
         }
         let distance = |(at, goal): (DVec3, DVec3)| (at - goal).length();
         let objects = self.above_rest(self.points(&observation, 3));
@@ -140,10 +150,17 @@ impl Rehearsal {
     fn current_start(&self) -> TrialStart {
         let mut observation = vec![0.0; self.layout.n_observation()];
         self.env.observe(&mut observation);
-        let opening_m = if self.layout.task.grasps() { OPENING_M } else { 0.0 };
+        let grasps = self.layout.task.grasps();
+        let opening_m = if grasps { self.hand().max_opening_m() } else { 0.0 };
         let (hands, objects) = (self.points(&observation, 0), self.points(&observation, 3));
-        let objects = self.above_rest(objects);
-        TrialStart { hands, opening_m, objects, goals: self.goals(), shared: self.shared_object() }
+        TrialStart {
+            hands,
+            opening_m,
+            objects: self.above_rest(objects),
+            yaws_rad: self.yaws_rad(&observation),
+            goals: self.goals(),
+            shared: self.shared_object(),
+        }
     }
 
     /// The point at index `first` of each arm's observation.
@@ -152,15 +169,21 @@ impl Rehearsal {
         self.layout.arms().map(|arm| point(of_arm(arm))).collect()
     }
 
+    /// Returns the rotations of the objects about the vertical axis, radians.
+    fn yaws_rad(&self, observation: &[f32]) -> Vec<f64> {
+        let of_arm = |arm| yaw_rad(&observation[self.layout.observation_of(arm)]);
+        self.layout.arms().map(of_arm).collect()
+    }
+
     fn goals(&self) -> Vec<DVec3> {
         let goal = self.env.goal();
         let goals = self.layout.arms().map(|arm| point(&goal[self.layout.goal_of(arm)])).collect();
         self.above_rest(goals)
     }
 
-    /// Lowers positions of objects to the heights of the training world's own blocks.
+    /// Lowers positions of objects to the heights of the blocks that the policy knows.
     fn above_rest(&self, places: Vec<DVec3>) -> Vec<DVec3> {
-        let lower = DVec3::Z * (self.half_m - TRAINED_HALF_M);
+        let lower = DVec3::Z * (self.half_m - self.trained_half_m);
         places.into_iter().map(|place| place - lower).collect()
     }
 
@@ -187,6 +210,12 @@ impl Rehearsal {
 
 fn point(numbers: &[f32]) -> DVec3 {
     DVec3::new(numbers[0].into(), numbers[1].into(), numbers[2].into())
+}
+
+/// Returns the rotation of the object about the vertical axis in the observation of one arm, radians.
+fn yaw_rad(observation: &[f32]) -> f64 {
+    let [z, w] = [14, 15].map(|idx| f64::from(observation[idx]));
+    2.0 * libm::atan2(z, w)
 }
 
 fn horizontal_m(a: [f32; 3], b: [f32; 3]) -> f64 {

@@ -3,14 +3,16 @@
 use glam::DVec3;
 use tandem_core::{ArmIndex, TaskSpec};
 use tandem_kinematics::{
-    ArmWaypoint, CheckSettings, Joints, Motion, PlanSettings, Waypoint, check, plan,
+    ArmWaypoint, CheckSettings, Joints, Motion, PlanError, PlanSettings, ReachError, Waypoint,
+    check, plan,
 };
 use tandem_sim::SimError;
 
 use crate::simulated::{
-    Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair,
+    Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair, single,
 };
 use crate::trial::mapping::Mapping;
+use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{
     FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
 };
@@ -21,7 +23,7 @@ use crate::trial::{
     ActionSource, NoObserver, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver,
     TrialReport,
 };
-use tandem_bridge::work_cell::{check_settings, mico_cell};
+use tandem_bridge::work_cell::{check_settings, mico_cell_of};
 
 /// Samples per second of a motion.
 const RATE_HZ: f64 = 100.0;
@@ -29,7 +31,7 @@ const RATE_HZ: f64 = 100.0;
 pub(super) const REST_S: f64 = 0.5;
 /// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
 /// step can start.
-const STEP_GAP_M: f64 = 0.025;
+pub(super) const STEP_GAP_M: f64 = 0.025;
 /// Friction of the twin, as a share of the pair's.
 const TWIN_FRICTION: f32 = 0.8;
 
@@ -39,7 +41,7 @@ pub struct TrialRunner {
     /// The task of the policy.
     pub(super) task: TaskSpec,
     pub(super) mapping: Mapping,
-    rehearsal: Rehearsal,
+    pub(super) rehearsal: Rehearsal,
     pub(super) check: CheckSettings,
     /// The check of a step of the closed loop.
     pub(super) step_check: CheckSettings,
@@ -64,14 +66,21 @@ impl TrialRunner {
     /// # Errors
     /// Returns an error if there is no training world for its layout and blocks.
     pub fn new(config: TrialConfig) -> Result<Self, SimError> {
-        let mut cell = mico_cell();
+        let mut cell = mico_cell_of(config.layout.task.world());
         cell.arms.truncate(config.layout.n_arms);
-        let rehearsal = Rehearsal::new(config.layout, &config.block)?;
+        let trained_half_m = config.trained_half_m;
+        let rehearsal = Rehearsal::new(config.layout, &config.block, trained_half_m)?;
         let half_m = rehearsal.shared_object().map(|shared| shared.grasped_half_m());
         let block = Block { half_m: half_m.unwrap_or(config.block.half_m), ..config.block };
         let config = TrialConfig { block, ..config };
         Ok(Self {
-            mapping: Mapping::new(cell, config.layout, rehearsal.hand(), &config.block),
+            mapping: Mapping::new(
+                cell,
+                config.layout,
+                rehearsal.hand(),
+                &config.block,
+                trained_half_m,
+            ),
             rehearsal,
             task: config.layout.into(),
             check: check_settings(),
@@ -90,8 +99,8 @@ impl TrialRunner {
         policy: &mut dyn ActionSource,
         observer: &mut dyn TrialObserver,
     ) -> Result<TrialReport, TrialError> {
-        let start = self.rehearsal.start(self.config.seed, number)?;
-        let at = self.start_angles(&start)?;
+        let start = self.start(number)?;
+        let at = start_angles(&self.mapping, &start)?;
         let planned = match self.config.mode {
             TrialMode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
             TrialMode::Twin => Some(self.rehearse_on_twin(&start, &at, number, policy)?),
@@ -183,30 +192,6 @@ impl TrialRunner {
         })
     }
 
-    /// Converts the policy's episode in the training world to waypoints.
-    fn rehearse(
-        &mut self,
-        start: &TrialStart,
-        at: &[Joints],
-        policy: &mut dyn ActionSource,
-    ) -> Result<PlannedMotion, TrialError> {
-        let rollout = self.rehearsal.play(policy)?;
-        let mut openings = vec![start.opening_m; start.hands.len()];
-        let mut waypoints = vec![self.waypoint(&start.hands, &openings, at)];
-        for step in &rollout.steps {
-            for (arm, opening_m) in openings.iter_mut().enumerate() {
-                let action = &step.action[self.config.layout.action_of(ArmIndex(arm))];
-                *opening_m = self.mapping.opening_after(*opening_m, action);
-            }
-            waypoints.push(self.waypoint(&step.hands, &openings, at));
-        }
-        Ok(PlannedMotion {
-            waypoints: waypoints.into_iter().collect(),
-            rehearsed_m: rollout.goal_distances_m,
-            n_steps: rollout.steps.len(),
-        })
-    }
-
     /// Computes the waypoints by a closed loop on a copy of the pair.
     fn rehearse_on_twin(
         &self,
@@ -229,39 +214,6 @@ impl TrialRunner {
             rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
             n_steps: execution.n_steps,
         })
-    }
-
-    /// Executes a motion that was planned before.
-    fn open_loop(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        at: &[Joints],
-        planned: PlannedMotion,
-    ) -> TrialExecution {
-        let waypoints = planned.waypoints.clone().unwrap_or_default();
-        let ended = planned
-            .waypoints
-            .and_then(|waypoints| self.motion(&waypoints, at, &self.check))
-            .and_then(|motion| rig.play(motion, self.config.speed));
-        let mut n_in_success = 0;
-        let n_judged = self.task.success_steps();
-        let ended = ended.and_then(|()| {
-            (0..n_judged).try_for_each(|_| {
-                rig.wait(REST_S / n_judged as f64)?;
-                n_in_success = if self.is_success(rig, start) { n_in_success + 1 } else { 0 };
-                Ok(())
-            })
-        });
-        TrialExecution {
-            ended,
-            n_in_success,
-            n_steps: planned.n_steps,
-            n_shortened: 0,
-            rehearsed_m: Some(planned.rehearsed_m),
-            timed_out: false,
-            waypoints,
-        }
     }
 
     /// Plans the motion through `waypoints` from joint angles `at` (radians) and checks it with `settings`.
@@ -290,31 +242,25 @@ impl TrialRunner {
         near: &[Joints],
     ) -> Result<Waypoint, FailureCause> {
         let arm_waypoint = |arm: usize| {
-            let (tool_in_world_m, _) =
-                self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm])?;
+            let tool = self.mapping.tool_in_world(ArmIndex(arm), hands[arm], &near[arm]);
+            let (tool_in_world_m, _) = tool.map_err(|source| unreachable(ArmIndex(arm), source))?;
             Ok(ArmWaypoint {
                 tool_in_world_m: tool_in_world_m.into(),
                 gripper_opening: self.mapping.opening(openings_m[arm]),
             })
         };
-        let arms = (0..hands.len()).map(|arm| {
-            arm_waypoint(arm).map_err(|source| {
-                let arm = ArmIndex(arm);
-                FailureCause::Refused(MotionRefusal::Plan(
-                    tandem_kinematics::PlanError::Unreachable { waypoint: 0, arm, source },
-                ))
-            })
-        });
-        arms.collect()
+        (0..hands.len()).map(arm_waypoint).collect()
     }
 
-    fn start_angles(&self, start: &TrialStart) -> Result<Vec<Joints>, TrialError> {
-        let angles = |(arm, hand): (usize, &DVec3)| {
-            let near = Joints::new(self.mapping.cell().arms[arm].model.elbow_up_rad);
-            let found = self.mapping.tool_in_world(ArmIndex(arm), *hand, &near);
-            found.map(|(_, angles)| angles).map_err(|source| TrialError::Start { arm, source })
+    /// Draws the start of trial `number`, at which the arms are as far apart as the check requires.
+    fn start(&mut self, number: u64) -> Result<TrialStart, TrialError> {
+        let Self { mapping, check, .. } = self;
+        let is_free = |start: &TrialStart| {
+            // An arm that cannot reach the start is reported later.
+            start_angles(mapping, start)
+                .map_or(true, |at| mapping.cell().gaps(&at).arms_m >= check.arms_gap_m)
         };
-        start.hands.iter().enumerate().map(angles).collect()
+        self.rehearsal.start(self.config.seed, number, is_free)
     }
 
     fn in_world(&self, own: &[DVec3]) -> Vec<DVec3> {
@@ -329,15 +275,15 @@ impl TrialRunner {
         number: u64,
         simulated: &SimulatedConfig,
     ) -> SimulatedPair {
-        let block = |at: DVec3| {
-            let at = at.as_vec3();
-            Block { at_m: [at.x, at.y], ..self.config.block }
+        let block = |(at, yaw_rad): (DVec3, &f64)| {
+            let (at, yaw_rad) = (at.as_vec3(), single(*yaw_rad));
+            Block { at_m: [at.x, at.y], yaw_rad, ..self.config.block }
         };
         let points = self.in_world(&start.objects);
         let shared = start.shared.clone().map(|shared| placed(shared, &points));
         let blocks = match shared {
             Some(_) => Vec::new(),
-            None => points.into_iter().map(block).collect(),
+            None => points.into_iter().zip(&start.yaws_rad).map(block).collect(),
         };
         let config = SimulatedConfig {
             seed: self.config.seed.wrapping_mul(1_000_003).wrapping_add(number),
@@ -350,12 +296,20 @@ impl TrialRunner {
     }
 }
 
-/// A motion that was planned before its execution.
-struct PlannedMotion {
-    waypoints: Result<Vec<Waypoint>, FailureCause>,
-    /// The final distances of the objects from their goals in the rehearsal, metres.
-    rehearsed_m: Vec<f64>,
-    n_steps: usize,
+/// Returns the joint angles of the arms at `start`, radians.
+fn start_angles(mapping: &Mapping, start: &TrialStart) -> Result<Vec<Joints>, TrialError> {
+    let angles = |(arm, hand): (usize, &DVec3)| {
+        let near = Joints::new(mapping.cell().arms[arm].model.elbow_up_rad);
+        let found = mapping.tool_in_world(ArmIndex(arm), *hand, &near);
+        found.map(|(_, angles)| angles).map_err(|source| TrialError::Start { arm, source })
+    };
+    start.hands.iter().enumerate().map(angles).collect()
+}
+
+/// Returns the failure of a motion to a position that `arm` cannot reach.
+pub(super) fn unreachable(arm: ArmIndex, source: ReachError) -> FailureCause {
+    let error = PlanError::Unreachable { waypoint: 0, arm, source };
+    FailureCause::Refused(MotionRefusal::Plan(error))
 }
 
 /// Returns the configuration of the twin: the pair without noise and latency and with other friction.

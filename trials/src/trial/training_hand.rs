@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use tandem_sim::description::WorldDescription;
+use tandem_sim::reach::Reach;
 
 /// The servo and the gripper of the training world's hand.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +21,10 @@ pub struct TrainingHand {
     action_m: f64,
     /// The workspace of the end effector, own frame: low and high corner, metres.
     workspace_m: [DVec3; 2],
+    /// The part of the workspace that the arm reaches; all of it if there is none.
+    reach: Option<&'static Reach>,
+    /// The largest opening of each side of the gripper, metres.
+    max_opening_m: f64,
     /// The speed of each side of the gripper at an action of 1, metres per second.
     opening_speed_mps: f64,
 }
@@ -38,6 +43,8 @@ impl TrainingHand {
             acceleration_mps2: decimal(hand.palm_force_n) / decimal(hand.mass_kg),
             action_m: decimal(hand.action_m),
             workspace_m: [corner(hand.workspace_low_m), corner(hand.workspace_high_m)],
+            reach: hand.reach,
+            max_opening_m: decimal(hand.max_opening_m),
             opening_speed_mps: decimal(hand.opening_speed_mps),
         }
     }
@@ -52,10 +59,9 @@ impl TrainingHand {
     /// `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
-        let [low, high] = self.workspace_m;
         let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
         let displacement = asked.clamp(DVec3::NEG_ONE, DVec3::ONE) * self.action_m;
-        let target = (hand + displacement).clamp(low, high);
+        let target = self.reachable(hand + displacement);
         let substep_s = self.control_step_s / f64::from(self.n_substeps);
         let most = DVec3::splat(self.acceleration_mps2 * substep_s);
         let (mut at, mut velocity) = (hand, velocity);
@@ -66,7 +72,34 @@ impl TrainingHand {
             velocity += (desired - velocity).clamp(-most, most);
             at += velocity * substep_s;
         }
-        (at.clamp(low, high), velocity)
+        (self.reachable(at), velocity)
+    }
+
+    /// Returns the nearest position to `at` that the hand may have; own frame, metres.
+    fn reachable(&self, at: DVec3) -> DVec3 {
+        let [low, high] = self.workspace_m;
+        let at = at.clamp(low, high);
+        self.reach.map_or(at, |reach| reach.clamp(at.as_vec3()).as_dvec3())
+    }
+
+    /// Returns the velocity at the end of a step per displacement in it, in metres per step and metre, for a body that
+    /// approaches its target as the hand does: exponentially.
+    #[must_use]
+    pub fn end_velocity_share(&self) -> f64 {
+        let exponent = self.gain_per_s * self.control_step_s;
+        exponent / (libm::exp(exponent) - 1.0)
+    }
+
+    /// The smallest height of the end effector above the table, metres.
+    #[must_use]
+    pub fn lowest_m(&self) -> f64 {
+        self.workspace_m[0].z
+    }
+
+    /// The largest opening of each side of the gripper, metres.
+    #[must_use]
+    pub fn max_opening_m(&self) -> f64 {
+        self.max_opening_m
     }
 
     /// Returns the change of the gripper's opening in a step with an action of 1, metres on each side.
@@ -84,6 +117,7 @@ fn decimal(number: f32) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::{DVec2, Vec3Swizzles as _};
     use tandem_core::{Layout, Task};
     use tandem_sim::{Env, WorldConfig};
 
@@ -104,6 +138,9 @@ mod tests {
             let low_z = hand.workspace_m[0].z;
             assert!((at.z - low_z).abs() < 1e-12, "{task}: the workspace's floor");
         }
+        let shared = hand_of(Task::SharedPush);
+        let (far, _) = shared.after(DVec3::new(0.2, 0.15, 0.3), DVec3::ZERO, &ahead);
+        assert!((far.xy() + DVec2::X * 0.22).length() < 0.376, "{far}: out of the arm's reach");
         let slow = hand_of(Task::CarryBar);
         let (_, velocity) = slow.after(DVec3::Z, DVec3::ZERO, &[1.0, 1.0, -1.0, 0.0]);
         assert!(velocity.length() < 0.2 + 1e-9, "{velocity}");
