@@ -63,7 +63,11 @@ def tandem(program, *arguments):
         raise Wrong(f"{program} does not exist: build it with `cargo build --release`, or give --tandem") from None
     except subprocess.CalledProcessError as error:
         raise Wrong(error.stderr.strip() or f"{program} ended with {error.returncode}") from None
-    return json.loads(done.stdout)
+    scene = json.loads(done.stdout)
+    world = scene["world"]
+    if world["kinematics"]["arm"] != "jaco":
+        raise Wrong(f"{world['task']}: its hands tilt, and only hands that point down can be simulated in MuJoCo")
+    return scene
 
 
 def wilson(hits, n):

@@ -8,7 +8,7 @@ const ALLOWED: [(&str, &[&str]); 20] = [
     ("core", &[]),
     ("system", &[]),
     ("kinematics", &["core"]),
-    ("sim", &["core"]),
+    ("sim", &["core", "kinematics"]),
     ("picture", &["core"]),
     ("policy", &["core", "system"]),
     ("proto", &["core"]),

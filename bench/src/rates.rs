@@ -29,7 +29,10 @@ const SGEMM_EDGE: usize = 256;
 /// When a step fails, which is a bug.
 pub fn sim(clock: &Clock) -> Result<Vec<Figure>, Error> {
     let mut figures = Vec::new();
-    for (task, n_arms) in Task::ALL.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
+    let worlds = Task::ALL
+        .into_iter()
+        .flat_map(|task| (task.min_arms()..=2).map(move |n_arms| (task, n_arms)));
+    for (task, n_arms) in worlds {
         let layout = Layout::new(task, n_arms);
         let mut world = Env::new(layout, &WorldConfig::default())?;
         let mut rng = episode_rng(1, 0, Stream::Exploration);

@@ -1,9 +1,11 @@
 //! Statistics of the calls of idle workers, and what is measured.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use tandem_bench::rates::thread_counts;
-use tandem_bench::{LoadTimings, quantile};
+use tandem_bench::rates::{sim, thread_counts};
+use tandem_bench::{Clock, LoadTimings, quantile};
 
 fn ms(millis: u64) -> Duration {
     Duration::from_millis(millis)
@@ -71,4 +73,16 @@ fn thread_counts_double_up_to_the_number_of_cores() {
     assert_eq!(counts(2), [2]);
     assert_eq!(counts(6), [2, 4, 6]);
     assert_eq!(counts(16), [2, 4, 8, 16]);
+}
+
+#[test]
+fn every_task_is_simulated_with_every_number_of_arms_it_takes() {
+    let seconds = AtomicU64::new(0);
+    let clock: Clock =
+        Arc::new(move || Duration::from_secs(seconds.fetch_add(1, Ordering::Relaxed)));
+    let names: Vec<String> = sim(&clock).unwrap().into_iter().map(|figure| figure.name).collect();
+    for name in ["push/1-arm", "push/2-arm", "shared-push/2-arm", "carry-bar/2-arm"] {
+        assert!(names.contains(&format!("sim/{name}")), "{names:?}");
+    }
+    assert!(!names.contains(&"sim/carry-bar/1-arm".to_owned()), "a bar takes two arms");
 }

@@ -202,11 +202,12 @@ struct TwoLinks {
 impl TwoLinks {
     fn of(model: &ArmModel) -> Self {
         let origin_m = |joint: usize| model.joints[joint].origin_m();
+        let lengths = model.plane_lengths_m();
         Self {
-            shoulder_z_m: model.shoulder_m().z,
+            shoulder_z_m: lengths.shoulder_height_m,
             aside_m: origin_m(1).y + origin_m(3).z,
-            upper_m: -origin_m(2).y,
-            fore_m: origin_m(3).y - model.last_from_tool.translation.z,
+            upper_m: lengths.upper_arm_m,
+            fore_m: lengths.forearm_m + lengths.hand_m,
         }
     }
 

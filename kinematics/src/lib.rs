@@ -81,7 +81,7 @@ pub use forward::ForwardKinematics;
 pub use inverse::{ReachError, Solution, ToolTarget};
 pub use joints::Joints;
 pub use limits::Limits;
-pub use model::{ArmModel, MICO_4};
+pub use model::{ArmModel, MICO_4, PADS_AHEAD_M};
 pub use motion::{ArmSample, Motion};
 pub use plan::{ArmWaypoint, PlanError, PlanSettings, Waypoint, plan};
 pub use refusal::{Excess, Reason, Refusal};

@@ -7,7 +7,7 @@ mod mico;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-pub use self::mico::MICO_4;
+pub use self::mico::{MICO_4, PADS_AHEAD_M};
 use crate::joints::Joints;
 
 /// A revolute joint: its frame and its limits.
@@ -73,6 +73,19 @@ pub struct ArmModel {
     pub elbow_up_rad: &'static [f64],
 }
 
+/// The lengths of an arm with four joints, whose links lie in one vertical plane, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlaneLengths {
+    /// Height of the shoulder above the base's origin.
+    pub shoulder_height_m: f64,
+    /// From the shoulder to the elbow.
+    pub upper_arm_m: f64,
+    /// From the elbow to the last joint.
+    pub forearm_m: f64,
+    /// From the last joint to the tool's origin.
+    pub hand_m: f64,
+}
+
 impl Anchor {
     /// Returns the origin of `frame`.
     #[must_use]
@@ -100,6 +113,22 @@ impl ArmModel {
     #[must_use]
     pub fn shoulder_m(&self) -> Point3<f64> {
         Point3::new(0.0, 0.0, self.joints[0].origin_m().z - self.joints[1].origin_m().z)
+    }
+
+    /// Returns the lengths of the arm's links in their plane, metres.
+    ///
+    /// # Panics
+    /// If the arm does not have four joints.
+    #[must_use]
+    pub fn plane_lengths_m(&self) -> PlaneLengths {
+        assert_eq!(self.n_joints(), 4, "links in one plane");
+        let origin_m = |joint: usize| self.joints[joint].origin_m();
+        PlaneLengths {
+            shoulder_height_m: self.shoulder_m().z,
+            upper_arm_m: -origin_m(2).y,
+            forearm_m: origin_m(3).y,
+            hand_m: -self.last_from_tool.translation.z,
+        }
     }
 
     /// Returns an upper bound on the distance between shoulder and tool, metres. Arms with four joints attain it.

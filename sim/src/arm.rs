@@ -1,4 +1,6 @@
 //! An arm: a hand, which is a body of the physics simulation, and the joints that follow it.
+//!
+//! The joints of a Jaco follow by iterated inverse kinematics, those of a Mico have a closed form.
 
 use rapier3d::glamx::{DMat3, DVec3};
 use rapier3d::math::{Matrix, Vector};
@@ -8,7 +10,8 @@ use crate::config::WorldConfig;
 use crate::frame::ArmFrame;
 use crate::hand::{Gripper, Hand, HandSettings};
 use crate::kinematics::{ForwardKinematics, HOME, JointAngles, solve_inverse};
-use crate::parameters::WorldParameters;
+use crate::mico::{JointPoints, Mico};
+use crate::parameters::{ArmKind, WorldParameters};
 use crate::physics::Physics;
 
 /// Displacement of the end effector for an action of 1, metres.
@@ -33,7 +36,7 @@ pub(crate) struct Arm {
     pub(crate) frame: ArmFrame,
     pub(crate) hand: Hand,
     pub(crate) parameters: &'static WorldParameters,
-    /// At the start of the latest control step.
+    /// Joint angles of a Jaco at the start of the latest control step.
     angles: JointAngles,
 }
 
@@ -52,6 +55,10 @@ impl Arm {
             pad_friction: config.friction(task).pads,
             grip_force_n: config.grip_force_n,
             palm_force_n: parameters.palm_force_n,
+            mico: match parameters.arms {
+                ArmKind::Jaco => None,
+                ArmKind::Mico => Some(Mico::in_shared_world()),
+            },
         };
         let hand = Hand::build(physics, arm, frame, settings);
         Self { frame, hand, parameters, angles: HOME }
@@ -66,15 +73,25 @@ impl Arm {
         opening_m: f32,
     ) {
         self.hand.place(physics, end_effector_in_arm, opening_m);
-        self.angles = solve_inverse(HOME, self.tool_in_base(physics), REACH_ITERATIONS);
+        if self.parameters.arms == ArmKind::Jaco {
+            self.angles = solve_inverse(HOME, self.tool_in_base(physics), REACH_ITERATIONS);
+        }
     }
 
     /// Updates the joint angles to the current position of the hand.
     pub(crate) fn track(&mut self, physics: &Physics) {
-        self.angles = self.angles_now(physics, TRACK_ITERATIONS);
+        if self.parameters.arms == ArmKind::Jaco {
+            self.angles = self.angles_now(physics, TRACK_ITERATIONS);
+        }
     }
 
-    /// Returns the joint angles for the current position of the hand, radians.
+    /// Returns the joints of a Mico for the current position of the hand, arm frame, metres; nothing for another arm.
+    pub(crate) fn mico_joints(&self, physics: &Physics) -> Option<JointPoints> {
+        let in_arm = self.frame.arm_from_world(self.hand.end_effector(physics));
+        self.hand.settings.mico.map(|mico| mico.posture(in_arm).joints())
+    }
+
+    /// Returns the joint angles of a Jaco for the current position of the hand, radians.
     pub(crate) fn angles_now(&self, physics: &Physics, n_iterations: usize) -> JointAngles {
         solve_inverse(self.angles, self.tool_in_base(physics), n_iterations)
     }
@@ -96,8 +113,8 @@ impl Arm {
         self.parameters.limit_speed(velocity)
     }
 
-    /// Returns the origin of each of the link frames `frames` (world frame, metres) and its Jacobian with respect to
-    /// the palm's position.
+    /// Returns the origin of each of the link frames `frames` of a Jaco (world frame, metres) and its Jacobian with
+    /// respect to the palm's position.
     pub(crate) fn point_jacobians<const N: usize>(
         &self,
         frames: [usize; N],

@@ -4,7 +4,7 @@
 //! simulator computes with. Vectors are in the world frame unless a field names another one: the origin is the centre
 //! of the table top, and z points up.
 
-use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyHandle};
+use rapier3d::dynamics::{CoefficientCombineRule, RigidBody, RigidBodyHandle};
 use rapier3d::geometry::{Collider, SharedShape};
 use rapier3d::math::{Pose, Vector};
 use serde::Serialize;
@@ -12,7 +12,10 @@ use tandem_core::layout::{EPISODE_STEPS, GOAL_TOLERANCE_M};
 use tandem_core::{ArmIndex, Layout};
 
 use crate::arm::{ACTION_M, REACH_ITERATIONS, TRACK_ITERATIONS};
-use crate::capsule::{GRIPPER_ENDS, GRIPPER_RADIUS_M, LINK_FRAMES, LINK_RADII_M};
+pub use crate::capsule::Capsules;
+use crate::capsule::{
+    GRIPPER_ENDS, GRIPPER_RADIUS_M, LINK_FRAMES, LINK_RADII_M, describe_mico_capsules,
+};
 use crate::config::WorldConfig;
 use crate::hand::{
     FINGER_HOLD_FORCE_N, FINGER_HOLD_GAIN, FINGERS_MASS_KG, Gripper, OPENING_END_GAIN,
@@ -21,7 +24,9 @@ use crate::hand::{
 pub use crate::kinematics::DhRow;
 use crate::kinematics::{DAMPING, DH_TABLE, HOME, MAX_ANGLE_STEP_RAD, SQUARED_ERROR_TOLERANCE};
 use crate::link_avoidance as damper;
-use crate::parameters::WorldParameters;
+use crate::mico::Mico;
+pub use crate::mico::MicoKinematics;
+use crate::parameters::{ArmKind, WorldParameters};
 pub use crate::physics::Part;
 use crate::physics::{GRAVITY, owner};
 use crate::reach::Reach;
@@ -55,19 +60,21 @@ pub struct WorldDescription {
     pub arms: Vec<ArmDescription>,
     /// The control law of the hands.
     pub hand: HandControl,
-    /// The inverse kinematics of the arms.
+    /// The kinematics of the arms.
     pub kinematics: Kinematics,
     /// The velocity damper that keeps the links of two arms apart.
     pub link_avoidance: LinkAvoidance,
 }
 
-/// A rigid body. Its mass is the sum of those of its shapes.
+/// A rigid body. Its mass is the sum of those of its shapes and of its own.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BodyDescription {
     /// Whether the body can rotate.
     pub rotates: bool,
     /// Factor of gravity: 0 or 1.
     pub gravity_scale: f32,
+    /// Mass at the body's origin that belongs to no shape, kilograms.
+    pub own_mass_kg: f32,
 }
 
 /// A shape with uniform density.
@@ -134,9 +141,9 @@ pub struct FingerDescription {
     pub mass_kg: f32,
     /// Fraction of the mass of all fingers of the hand.
     pub mass_fraction: f32,
-    /// Position of the closed finger relative to the palm, metres.
+    /// Position of the closed finger relative to the palm, in an upright hand, metres.
     pub closed_offset_m: [f32; 3],
-    /// Direction of opening along y: 1 or −1.
+    /// Direction of opening along y, in an upright hand: 1 or −1.
     pub outward: f32,
 }
 
@@ -176,9 +183,19 @@ pub struct HandControl {
     pub finger_hold_gain_per_s: f32,
 }
 
-/// The parameters of the inverse kinematics, by damped least squares.
+/// The kinematics of an arm.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Kinematics {
+#[serde(tag = "arm", rename_all = "snake_case")]
+pub enum Kinematics {
+    /// Six joints, hand straight down, inverse kinematics by iteration.
+    Jaco(Box<JacoKinematics>),
+    /// Four joints, a hand that tilts, inverse kinematics in closed form.
+    Mico(MicoKinematics),
+}
+
+/// The parameters of a Jaco's inverse kinematics, by damped least squares.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct JacoKinematics {
     /// Position of the arm's base, arm frame, metres.
     pub base_in_arm_m: [f32; 3],
     /// Denavit–Hartenberg table, from base to wrist.
@@ -200,18 +217,9 @@ pub struct Kinematics {
 /// The capsules and parameters of the velocity damper.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LinkAvoidance {
-    /// Frames of the Denavit–Hartenberg table whose origins are the ends of the links' capsules.
-    pub link_frames: [usize; 4],
-    /// Radii of the links, metres.
-    pub link_radii_m: [f32; 3],
-    /// Heights of the ends of the wrist's capsule above the end effector, metres.
-    pub wrist_above_m: [f32; 2],
-    /// Radius of the wrist, metres.
-    pub wrist_radius_m: f32,
-    /// Ends of the capsule around palm plate and fingers, relative to the end effector, arm frame, metres.
-    pub gripper_ends_m: [[f32; 3]; 2],
-    /// Radius of this capsule, metres.
-    pub gripper_radius_m: f32,
+    /// The capsules of an arm.
+    #[serde(flatten)]
+    pub capsules: Capsules,
     /// Largest approach speed per metre of gap, 1/s.
     pub approach_gain_per_s: f32,
     /// Largest speed of separation that an overlap demands, metres per second.
@@ -247,16 +255,23 @@ pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> W
         arms: layout.arms().map(|arm| arm_description(world, arm)).collect(),
         hand: hand_control(config, world.parameters),
         kinematics: kinematics(world.parameters),
-        link_avoidance: link_avoidance(),
+        link_avoidance: link_avoidance(world),
     }
 }
 
 fn bodies(world: &World) -> Vec<BodyDescription> {
-    let describe = |body: &rapier3d::dynamics::RigidBody| BodyDescription {
+    let describe = |(handle, body): (RigidBodyHandle, &RigidBody)| BodyDescription {
         rotates: !body.is_rotation_locked().contains(&true),
         gravity_scale: body.gravity_scale(),
+        own_mass_kg: own_mass_kg(world, handle),
     };
-    world.physics.bodies.iter().map(|(_, body)| describe(body)).collect()
+    world.physics.bodies.iter().map(describe).collect()
+}
+
+/// Returns the mass of a body that belongs to none of its shapes, kilograms.
+fn own_mass_kg(world: &World, body: RigidBodyHandle) -> f32 {
+    let hand = world.arms.iter().map(|arm| &arm.hand).find(|hand| hand.palm == body);
+    hand.map_or(0.0, |hand| hand.settings.mass_at_end_effector_kg())
 }
 
 fn shapes(world: &World) -> Vec<ShapeDescription> {
@@ -333,8 +348,8 @@ fn arm_description(world: &World, idx: ArmIndex) -> ArmDescription {
                 body: body_index(world, finger.body),
                 mass_kg: finger.mass_kg,
                 mass_fraction: finger.mass_fraction,
-                closed_offset_m: finger.closed_offset.to_array(),
-                outward: finger.outward,
+                closed_offset_m: arm.frame.rotate(finger.closed_offset).to_array(),
+                outward: arm.frame.sign * finger.side,
             })
             .collect(),
     }
@@ -371,7 +386,10 @@ fn hand_control(config: &WorldConfig, parameters: &WorldParameters) -> HandContr
 }
 
 fn kinematics(parameters: &WorldParameters) -> Kinematics {
-    Kinematics {
+    if parameters.arms == ArmKind::Mico {
+        return Kinematics::Mico(Mico::in_shared_world().describe());
+    }
+    Kinematics::Jaco(Box::new(JacoKinematics {
         base_in_arm_m: parameters.base_in_arm.to_array(),
         dh_table: DH_TABLE,
         home_rad: HOME,
@@ -380,17 +398,26 @@ fn kinematics(parameters: &WorldParameters) -> Kinematics {
         squared_error_tolerance: SQUARED_ERROR_TOLERANCE,
         reach_iterations: REACH_ITERATIONS,
         track_iterations: TRACK_ITERATIONS,
-    }
+    }))
 }
 
-fn link_avoidance() -> LinkAvoidance {
-    LinkAvoidance {
+fn capsules(world: &World) -> Capsules {
+    if world.parameters.arms == ArmKind::Mico {
+        return describe_mico_capsules(&world.arms[0].hand.settings);
+    }
+    Capsules::Jaco {
         link_frames: LINK_FRAMES,
         link_radii_m: LINK_RADII_M,
         wrist_above_m: WRIST_ABOVE_M,
         wrist_radius_m: WRIST_RADIUS_M,
         gripper_ends_m: GRIPPER_ENDS.map(|end| end.to_array()),
         gripper_radius_m: GRIPPER_RADIUS_M,
+    }
+}
+
+fn link_avoidance(world: &World) -> LinkAvoidance {
+    LinkAvoidance {
+        capsules: capsules(world),
         approach_gain_per_s: damper::APPROACH_GAIN,
         separation_mps: damper::SEPARATION_MPS,
         influence_distance_m: damper::INFLUENCE_DISTANCE_M,
@@ -403,83 +430,4 @@ fn link_avoidance() -> LinkAvoidance {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use tandem_core::Task;
-
-    use crate::env::Env;
-
-    fn described(task: Task, n_arms: usize) -> WorldDescription {
-        let env = Env::new(Layout::new(task, n_arms), &WorldConfig::default()).unwrap();
-        env.description()
-    }
-
-    fn mass_kg(world: &WorldDescription, body: usize) -> f32 {
-        world
-            .shapes
-            .iter()
-            .filter(|shape| shape.body == Some(body))
-            .map(|shape| shape.mass_kg)
-            .sum()
-    }
-
-    #[test]
-    fn masses_are_those_of_the_control_law() {
-        for (task, n_arms) in [(Task::Push, 1), (Task::PickAndPlace, 2)] {
-            let world = described(task, n_arms);
-            assert_eq!(world.arms.len(), n_arms);
-            for arm in &world.arms {
-                let fingers_kg: f32 =
-                    arm.fingers.iter().map(|finger| mass_kg(&world, finger.body)).sum();
-                let hand_kg = mass_kg(&world, arm.palm) + fingers_kg;
-                assert!((hand_kg - world.hand.mass_kg).abs() < 1e-6, "{task}: {hand_kg}");
-                assert!((mass_kg(&world, arm.object) - 0.1).abs() < 1e-6);
-            }
-        }
-    }
-
-    #[test]
-    fn arms_that_share_an_object_bring_two_points_of_one_body_to_their_goals() {
-        let world = described(Task::CarryBar, 2);
-        let [first, second] = &world.arms[..] else { panic!("two arms") };
-        assert_eq!(first.object, second.object);
-        assert_eq!(
-            [first, second].map(|arm| arm.object_point_m),
-            [[-0.16, 0.0, 0.0], [0.16, 0.0, 0.0]]
-        );
-        assert!((mass_kg(&world, first.object) - 0.5).abs() < 1e-6);
-        let own = described(Task::PickAndPlace, 2);
-        assert!(own.arms.iter().all(|arm| arm.object_point_m == [0.0; 3]));
-        assert_ne!(own.arms[0].object, own.arms[1].object);
-    }
-
-    #[test]
-    fn pairs_have_the_friction_of_the_decision_records_and_hands_do_not_collide_with_themselves() {
-        let world = described(Task::PickAndPlace, 2);
-        let mut frictions: Vec<f32> = Vec::new();
-        for pair in &world.contact_pairs {
-            let [first, second] = pair.shapes.map(|shape| &world.shapes[shape]);
-            let is_one_hand = first.part == Part::Hand && second.part == Part::Hand;
-            assert!(!(is_one_hand && first.arm == second.arm), "{pair:?}");
-            if [first.part, second.part] == [Part::Table, Part::Object] {
-                assert_eq!(pair.friction, 0.6);
-            }
-            frictions.push(pair.friction);
-        }
-        frictions.sort_by(f32::total_cmp);
-        frictions.dedup();
-        assert_eq!(frictions, [0.4, 0.45, 0.6]);
-        assert_eq!(world.contact_pairs.len(), 2 + 10 + 1 + 20 + 25);
-    }
-
-    #[test]
-    fn the_fingers_of_a_locked_gripper_are_shapes_of_the_palm() {
-        let n_shapes = |task| {
-            let world = described(task, 1);
-            let palm = Some(world.arms[0].palm);
-            (world.bodies.len(), world.shapes.iter().filter(|shape| shape.body == palm).count())
-        };
-        assert_eq!(n_shapes(Task::Push), (2, 5));
-        assert_eq!(n_shapes(Task::PickAndPlace), (5, 2));
-    }
-}
+mod tests;

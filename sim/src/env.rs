@@ -410,21 +410,22 @@ mod tests {
     /// Contacts amplify rounding errors, so the symmetry is exact only before the first contact. After it, swapping
     /// changes a trajectory about as much as a displacement of the objects by 0.1 µm does. A control step of the shared
     /// world has four times as many physics steps, so that a grasped object amplifies errors to a tenth of a millimetre
-    /// within the first one. The solver takes the contacts of a bar with both hands and both tables in an order, so swapping
+    /// within the first one. Its hands tilt, and rounding decides which corners of a tilted pad and a cube touch first, which
+    /// nudges do not change: it moves a cube by hundredths of a millimetre. The solver takes the contacts of a bar with both hands and both tables in an order, so swapping
     /// changes its way by up to a millimetre.
     #[test]
     fn swapping_the_arms_is_a_symmetry() {
-        for (task, n_episodes, most, first_m) in [
-            (Task::Push, 120, 1.5, 5e-6),
-            (Task::PickAndPlace, 240, 1.5, 5e-6),
-            (Task::SharedPush, 30, 3.0, 5e-6),
-            (Task::SharedPickAndPlace, 30, 3.0, 5e-4),
-            (Task::CarryBar, 16, 10.0, 5e-4),
+        for (task, n_episodes, most, corners_m, first_m) in [
+            (Task::Push, 120, 1.5, 0.0, 5e-6),
+            (Task::PickAndPlace, 240, 1.5, 0.0, 5e-6),
+            (Task::SharedPush, 30, 3.0, 5e-5, 5e-6),
+            (Task::SharedPickAndPlace, 30, 3.0, 5e-5, 5e-4),
+            (Task::CarryBar, 16, 10.0, 0.0, 5e-4),
         ] {
             let differences_m = differences_m(task, n_episodes);
             for (step, [swapping, nudging]) in differences_m.iter().enumerate() {
                 assert!(
-                    *swapping <= most * nudging,
+                    *swapping <= most * nudging + corners_m,
                     "{task}, step {step}: {swapping} m by swapping, {nudging} m by nudging"
                 );
             }
@@ -443,7 +444,7 @@ mod tests {
             let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
             let differences_m: Vec<Vec<f32>> =
                 (0..30).map(|episode| reflection_difference_m(&mut env, episode)).collect();
-            assert!(percentile_90_m(&differences_m, 0) < 1e-6, "{task}: {differences_m:?}");
+            assert!(percentile_90_m(&differences_m, 0) < 1e-6, "{task}:");
             for step in 0..N_STEPS {
                 let difference_m = percentile_90_m(&differences_m, step);
                 assert!(difference_m < most_m, "{task}, step {step}: {difference_m} m");

@@ -1,21 +1,27 @@
 //! The hand: a palm that a servo moves, and two or three fingers that open and close together.
 //!
-//! Palm and fingers are rapier bodies with locked rotations. One bounded force on the palm models the arm's motors.
+//! Palm and fingers are rapier bodies that no contact can rotate. One bounded force on the palm models the arm's motors.
 //! Forces hold the fingers in their places, and the palm receives the reaction; there are no joints. A locked gripper
 //! forms one rigid body with the palm, because compliant fingers would hook over an object's edge and drag it along.
+//!
+//! In the classic world hands point straight down. In the shared world they tilt as those of a Mico do: the position of
+//! the end effector determines the orientation, and bodies rotate at the rate that follows from the palm's velocity.
 
-use rapier3d::dynamics::{CoefficientCombineRule, RigidBodyBuilder, RigidBodyHandle};
+mod geometry;
+
+use rapier3d::dynamics::{
+    CoefficientCombineRule, MassProperties, RigidBodyBuilder, RigidBodyHandle,
+};
 use rapier3d::geometry::{ColliderBuilder, ColliderHandle};
-use rapier3d::math::{Pose, Vector};
+use rapier3d::math::{Pose, Rotation, Vector};
 use tandem_core::ArmIndex;
 
+use self::geometry::{FingerGeometry, PalmGeometry};
+pub(crate) use self::geometry::{HandGeometry, MICO_HAND, N_OBSERVED_FINGERS, THREE_FINGERS};
 use crate::frame::ArmFrame;
+use crate::mico::Mico;
 use crate::physics::{Part, Physics, collides};
 
-/// Half extents of the palm plate, metres.
-pub(crate) const PALM_HALF_M: Vector = Vector::new(0.035, 0.06, 0.015);
-/// Height of the palm plate's centre above the end effector, metres.
-pub(crate) const PALM_ABOVE_M: f32 = 0.065;
 /// Heights of the ends of the wrist's capsule above the end effector, metres.
 pub(crate) const WRIST_ABOVE_M: [f32; 2] = [0.10, 0.20];
 /// Radius of the wrist, metres.
@@ -30,62 +36,8 @@ pub(crate) const FINGER_HOLD_FORCE_N: f32 = 200.0;
 /// Gain of the force that returns a finger to its place, 1/s.
 pub(crate) const FINGER_HOLD_GAIN: f32 = 250.0;
 
-/// Position and mass of a finger.
-#[derive(Debug)]
-pub(crate) struct FingerGeometry {
-    /// Side of the hand, arm frame: 1 or −1 along y.
-    side: f32,
-    x_m: f32,
-    mass_kg: f32,
-}
-
-/// The fingers of a gripper and their pads.
-#[derive(Debug)]
-pub(crate) struct GripperGeometry {
-    /// At most [`N_OBSERVED_FINGERS`].
-    pub(crate) fingers: &'static [FingerGeometry],
-    /// For each observed finger the index of the one that it shows.
-    observed: [usize; N_OBSERVED_FINGERS],
-    /// Half extents of a finger pad (x, closing direction, z), metres.
-    pub(crate) pad_half: Vector,
-    /// Largest opening of each side of the gripper, metres.
-    pub(crate) max_opening_m: f32,
-    /// Speed of each side at full gripper input, metres per second.
-    pub(crate) opening_speed_mps: f32,
-}
-
-/// The gripper of the classic world. Two fingers oppose one. Their masses balance, so closing the gripper does not move
-/// the hand sideways.
-pub(crate) static THREE_FINGERS: GripperGeometry = GripperGeometry {
-    fingers: &[
-        FingerGeometry { side: 1.0, x_m: 0.016, mass_kg: 0.1 },
-        FingerGeometry { side: 1.0, x_m: -0.016, mass_kg: 0.1 },
-        FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
-    ],
-    observed: [0, 1, 2],
-    pad_half: Vector::new(0.010, 0.010, 0.020),
-    max_opening_m: 0.040,
-    opening_speed_mps: 0.25,
-};
-
-/// The gripper of the shared world: the two fingers of a Mico, as wide, as far open and as fast as those of the
-/// simulated pair of arms in `tandem-trials`. The first of them is observed twice.
-pub(crate) static MICO_GRIPPER: GripperGeometry = GripperGeometry {
-    fingers: &[
-        FingerGeometry { side: 1.0, x_m: 0.0, mass_kg: 0.2 },
-        FingerGeometry { side: -1.0, x_m: 0.0, mass_kg: 0.2 },
-    ],
-    observed: [0, 0, 1],
-    pad_half: Vector::new(0.008, 0.005, 0.015),
-    max_opening_m: 0.062,
-    opening_speed_mps: 0.062,
-};
-
 /// Mass of all fingers of a gripper, kilograms.
 pub(crate) const FINGERS_MASS_KG: f32 = 0.4;
-
-/// Number of fingers in an observation.
-pub(crate) const N_OBSERVED_FINGERS: usize = 3;
 
 /// The connection between fingers and palm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -96,22 +48,28 @@ pub(crate) enum Gripper {
     Driven,
 }
 
-impl GripperGeometry {
-    /// Returns the distance along x from the centre of the hand to the outer edge of its pads, metres.
-    pub(crate) fn reach_m(&self) -> f32 {
-        let outermost_m = self.fingers.iter().map(|finger| finger.x_m.abs()).fold(0.0, f32::max);
-        outermost_m + self.pad_half.x
-    }
-}
-
 /// The properties of a hand.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HandSettings {
     pub(crate) gripper: Gripper,
-    pub(crate) geometry: &'static GripperGeometry,
+    pub(crate) geometry: &'static HandGeometry,
     pub(crate) pad_friction: f32,
     pub(crate) grip_force_n: f32,
     pub(crate) palm_force_n: f32,
+    /// The arm whose posture tilts the hand; hands without one point straight down.
+    pub(crate) mico: Option<Mico>,
+}
+
+impl HandSettings {
+    /// Returns the mass of the palm's body that belongs to none of its shapes, kilograms. A hand that tilts about its end
+    /// effector has its mass there.
+    pub(crate) fn mass_at_end_effector_kg(&self) -> f32 {
+        match (self.mico, self.gripper) {
+            (None, _) => 0.0,
+            (Some(_), Gripper::Locked) => PALM_MASS_KG + FINGERS_MASS_KG,
+            (Some(_), Gripper::Driven) => PALM_MASS_KG,
+        }
+    }
 }
 
 /// The bodies of a hand.
@@ -132,10 +90,10 @@ pub(crate) struct Finger {
     pub(crate) mass_kg: f32,
     /// Fraction of the mass of all fingers, and weight in the mean opening.
     pub(crate) mass_fraction: f32,
-    /// Position of the closed finger relative to the palm, world frame, metres.
+    /// Position of the closed finger in the palm's frame, metres.
     pub(crate) closed_offset: Vector,
-    /// Direction of opening along the world's y axis: 1 or −1.
-    pub(crate) outward: f32,
+    /// Direction of opening along the palm's y axis: 1 or −1.
+    pub(crate) side: f32,
 }
 
 /// The state of a finger relative to the palm.
@@ -143,10 +101,20 @@ pub(crate) struct Finger {
 struct FingerState {
     opening_m: f32,
     opening_rate_mps: f32,
-    /// Position relative to that of the closed finger, world frame, metres.
+    /// Position relative to that of the closed finger, palm's frame, metres.
     offset: Vector,
-    /// Velocity relative to the palm, world frame, metres per second.
+    /// Velocity relative to the palm, palm's frame, metres per second.
     velocity: Vector,
+}
+
+/// The orientation of the palm and its motion, world frame.
+#[derive(Clone, Copy)]
+struct PalmMotion {
+    orientation: Rotation,
+    /// Metres per second.
+    velocity: Vector,
+    /// Radians per second.
+    angular_velocity: Vector,
 }
 
 impl Hand {
@@ -157,13 +125,13 @@ impl Hand {
         frame: ArmFrame,
         settings: HandSettings,
     ) -> Self {
-        let palm = build_palm(physics, arm, frame);
+        let palm = build_palm(physics, arm, frame, &settings);
         let mut build = |geometry: &FingerGeometry| {
             let body = match settings.gripper {
                 Gripper::Locked => palm,
                 Gripper::Driven => physics.bodies.insert(weightless_body(frame)),
             };
-            add_finger(physics, arm, frame, body, geometry, &settings)
+            add_finger(physics, arm, body, geometry, &settings)
         };
         let fingers = settings.geometry.fingers.iter().map(&mut build).collect();
         Self { frame, palm, fingers, settings }
@@ -173,17 +141,25 @@ impl Hand {
     /// `opening_m`.
     pub(crate) fn place(&self, physics: &mut Physics, end_effector_in_arm: Vector, opening_m: f32) {
         let at = self.frame.world_from_arm(end_effector_in_arm);
-        let palm = &mut physics.bodies[self.palm];
-        palm.set_translation(at, true);
-        palm.set_linvel(Vector::ZERO, true);
+        let turn = self.orientation_at(at);
+        place_body(physics, self.palm, Pose::from_parts(at, turn));
         for finger in self.driven_fingers() {
-            let body = &mut physics.bodies[finger.body];
-            body.set_translation(
-                at + finger.closed_offset + Vector::Y * (finger.outward * opening_m),
-                true,
-            );
-            body.set_linvel(Vector::ZERO, true);
+            let in_palm = finger.closed_offset + Vector::Y * (finger.side * opening_m);
+            place_body(physics, finger.body, Pose::from_parts(at + turn * in_palm, turn));
         }
+    }
+
+    /// Returns the orientation of the hand, world frame: its fingers close along y, and it points along −z.
+    pub(crate) fn orientation(&self, physics: &Physics) -> Rotation {
+        self.orientation_at(self.end_effector(physics))
+    }
+
+    /// Returns the orientation of the hand with its end effector at `at`, world frame, metres.
+    fn orientation_at(&self, at: Vector) -> Rotation {
+        let upright = self.frame.orientation_in_world();
+        self.settings.mico.map_or(upright, |mico| {
+            upright * mico.posture(self.frame.arm_from_world(at)).orientation()
+        })
     }
 
     /// Returns the position of the end effector, the centre between the pads; world frame, metres.
@@ -201,7 +177,13 @@ impl Hand {
         if self.settings.gripper == Gripper::Locked {
             return [(0.0, 0.0); N_OBSERVED_FINGERS];
         }
-        let states = self.finger_states(physics, self.velocity(physics));
+        let palm = &physics.bodies[self.palm];
+        let motion = PalmMotion {
+            orientation: self.orientation(physics),
+            velocity: palm.linvel(),
+            angular_velocity: palm.angvel(),
+        };
+        let states = self.finger_states(physics, motion);
         self.settings
             .geometry
             .observed
@@ -210,8 +192,9 @@ impl Hand {
 
     /// Returns the centres of the pads, world frame, metres.
     pub(crate) fn pads(&self, physics: &Physics) -> impl Iterator<Item = Vector> {
-        self.fingers.iter().map(|finger| match self.settings.gripper {
-            Gripper::Locked => self.end_effector(physics) + finger.closed_offset,
+        let turn = self.orientation(physics);
+        self.fingers.iter().map(move |finger| match self.settings.gripper {
+            Gripper::Locked => self.end_effector(physics) + turn * finger.closed_offset,
             Gripper::Driven => physics.bodies[finger.body].translation(),
         })
     }
@@ -229,9 +212,9 @@ impl Hand {
     #[cfg(test)]
     pub(crate) fn set_velocities(&self, physics: &mut Physics, palm: Vector, rates_mps: &[f32]) {
         physics.bodies[self.palm].set_linvel(palm, true);
+        let closing = self.orientation(physics) * Vector::Y;
         for (finger, rate_mps) in self.driven_fingers().iter().zip(rates_mps) {
-            physics.bodies[finger.body]
-                .set_linvel(palm + Vector::Y * (finger.outward * rate_mps), true);
+            physics.bodies[finger.body].set_linvel(palm + closing * (finger.side * rate_mps), true);
         }
     }
 
@@ -243,6 +226,7 @@ impl Hand {
         let substep_s = physics.substep_s();
         let total_mass_kg = PALM_MASS_KG + FINGERS_MASS_KG;
         let palm_velocity = self.velocity(physics);
+        let motion = self.turn(physics, palm_velocity);
         let palm_force = bounded(
             (velocity - palm_velocity) * (total_mass_kg / substep_s),
             self.settings.palm_force_n,
@@ -252,12 +236,33 @@ impl Hand {
         }
         let palm_velocity_next = palm_velocity + palm_force * (substep_s / total_mass_kg);
 
-        let finger_forces = self.finger_forces(physics, palm_velocity_next, gripper);
+        let motion = PalmMotion { velocity: palm_velocity_next, ..motion };
+        let finger_forces = self.finger_forces(physics, motion, gripper);
         for (finger, force) in self.fingers.iter().zip(finger_forces) {
             apply(physics, finger.body, force);
         }
         let reaction: Vector = finger_forces.into_iter().sum();
         apply(physics, self.palm, palm_force - reaction);
+    }
+
+    /// Rotates the bodies to the posture of the arm at the palm's position, and makes them follow it during the next
+    /// physics step, in which the palm has about `velocity` (world frame, metres per second). Hands that point down stay.
+    fn turn(&self, physics: &mut Physics, velocity: Vector) -> PalmMotion {
+        let upright = self.frame.orientation_in_world();
+        let Some(mico) = self.settings.mico else {
+            return PalmMotion { orientation: upright, velocity, angular_velocity: Vector::ZERO };
+        };
+        let posture = mico.posture(self.frame.arm_from_world(self.end_effector(physics)));
+        let orientation = upright * posture.orientation();
+        let in_arm = posture.angular_velocity(self.frame.rotate(velocity));
+        let angular_velocity = self.frame.rotate(in_arm);
+        let fingers = self.driven_fingers().iter().map(|finger| finger.body);
+        for handle in std::iter::once(self.palm).chain(fingers) {
+            let body = &mut physics.bodies[handle];
+            body.set_rotation(orientation, true);
+            body.set_angvel(angular_velocity, true);
+        }
+        PalmMotion { orientation, velocity, angular_velocity }
     }
 
     /// Returns the forces that open or close the fingers together and hold each in its place, world frame, newtons.
@@ -267,11 +272,11 @@ impl Hand {
     fn finger_forces(
         &self,
         physics: &Physics,
-        palm_velocity: Vector,
+        palm: PalmMotion,
         gripper: f32,
     ) -> [Vector; N_OBSERVED_FINGERS] {
         let substep_s = physics.substep_s();
-        let states = self.finger_states(physics, palm_velocity);
+        let states = self.finger_states(physics, palm);
         let mean = |value: fn(&FingerState) -> f32| -> f32 {
             self.fingers
                 .iter()
@@ -296,10 +301,9 @@ impl Hand {
                 * (FINGER_HOLD_GAIN * (opening_m - state.opening_m) + rate_mps
                     - state.opening_rate_mps))
                 .clamp(-FINGER_HOLD_FORCE_N, FINGER_HOLD_FORCE_N);
-            let closing_n =
-                finger.outward * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
+            let closing_n = finger.side * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
-            *force_n = Vector::new(held.x, closing_n, held.z);
+            *force_n = palm.orientation * Vector::new(held.x, closing_n, held.z);
         }
         forces_n
     }
@@ -316,17 +320,20 @@ impl Hand {
     fn finger_states(
         &self,
         physics: &Physics,
-        palm_velocity: Vector,
+        palm: PalmMotion,
     ) -> [FingerState; N_OBSERVED_FINGERS] {
         let palm_position = self.end_effector(physics);
+        let palm_from_world = palm.orientation.inverse();
         let mut states = [FingerState::default(); N_OBSERVED_FINGERS];
         for (finger, state) in self.fingers.iter().zip(&mut states) {
             let body = &physics.bodies[finger.body];
-            let offset = body.translation() - palm_position - finger.closed_offset;
-            let velocity = body.linvel() - palm_velocity;
+            let lever = body.translation() - palm_position;
+            let carried = palm.velocity + palm.angular_velocity.cross(lever);
+            let offset = palm_from_world * lever - finger.closed_offset;
+            let velocity = palm_from_world * (body.linvel() - carried);
             *state = FingerState {
-                opening_m: offset.y * finger.outward,
-                opening_rate_mps: velocity.y * finger.outward,
+                opening_m: offset.y * finger.side,
+                opening_rate_mps: velocity.y * finger.side,
                 offset,
                 velocity,
             };
@@ -335,28 +342,40 @@ impl Hand {
     }
 }
 
-fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) -> RigidBodyHandle {
-    let palm = physics.bodies.insert(weightless_body(frame));
+/// Adds the palm's body. That of a Mico has its mass at the end effector, about which the hand tilts.
+fn build_palm(
+    physics: &mut Physics,
+    arm: ArmIndex,
+    frame: ArmFrame,
+    settings: &HandSettings,
+) -> RigidBodyHandle {
+    let at_end_effector_kg = settings.mass_at_end_effector_kg();
+    let tilts = settings.mico.is_some();
+    let body = if tilts {
+        let mass = MassProperties::new(Vector::ZERO, at_end_effector_kg, Vector::ZERO);
+        weightless_body(frame).additional_mass_properties(mass)
+    } else {
+        weightless_body(frame)
+    };
+    let palm = physics.bodies.insert(body);
     let part = |shape: ColliderBuilder, mass_kg: f32, above_m: f32| {
         shape
             .translation(Vector::new(0.0, 0.0, above_m))
-            .mass(mass_kg)
+            .mass(if tilts { 0.0 } else { mass_kg })
             .friction(0.4)
             .collision_groups(collides(Part::Hand, arm))
     };
-    let plate = ColliderBuilder::cuboid(PALM_HALF_M.x, PALM_HALF_M.y, PALM_HALF_M.z);
-    let [low_m, high_m] = WRIST_ABOVE_M;
-    let wrist = ColliderBuilder::capsule_z(0.5 * (high_m - low_m), WRIST_RADIUS_M);
-    physics.colliders.insert_with_parent(
-        part(plate, 0.7 * PALM_MASS_KG, PALM_ABOVE_M),
-        palm,
-        &mut physics.bodies,
-    );
-    physics.colliders.insert_with_parent(
-        part(wrist, 0.3 * PALM_MASS_KG, 0.5 * (low_m + high_m)),
-        palm,
-        &mut physics.bodies,
-    );
+    let PalmGeometry { half, behind_m, has_wrist } = &settings.geometry.palm;
+    let plate = ColliderBuilder::cuboid(half.x, half.y, half.z);
+    let mut parts = vec![part(plate, 0.7 * PALM_MASS_KG, *behind_m)];
+    if *has_wrist {
+        let [low_m, high_m] = WRIST_ABOVE_M;
+        let wrist = ColliderBuilder::capsule_z(0.5 * (high_m - low_m), WRIST_RADIUS_M);
+        parts.push(part(wrist, 0.3 * PALM_MASS_KG, 0.5 * (low_m + high_m)));
+    }
+    for part in parts {
+        physics.colliders.insert_with_parent(part, palm, &mut physics.bodies);
+    }
     palm
 }
 
@@ -365,15 +384,15 @@ fn build_palm(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame) -> RigidBod
 fn add_finger(
     physics: &mut Physics,
     arm: ArmIndex,
-    frame: ArmFrame,
     body: RigidBodyHandle,
     geometry: &FingerGeometry,
     settings: &HandSettings,
 ) -> Finger {
     let pad_half = settings.geometry.pad_half;
     let closed_offset = Vector::new(geometry.x_m, geometry.side * pad_half.y, 0.0);
+    let is_weightless = settings.mico.is_some() && settings.gripper == Gripper::Locked;
     let pad = ColliderBuilder::cuboid(pad_half.x, pad_half.y, pad_half.z)
-        .mass(geometry.mass_kg)
+        .mass(if is_weightless { 0.0 } else { geometry.mass_kg })
         .friction(settings.pad_friction)
         .friction_combine_rule(CoefficientCombineRule::Max)
         .collision_groups(collides(Part::Hand, arm));
@@ -387,9 +406,17 @@ fn add_finger(
         pad,
         mass_kg: geometry.mass_kg,
         mass_fraction: geometry.mass_kg / FINGERS_MASS_KG,
-        closed_offset: frame.rotate(closed_offset),
-        outward: frame.rotate(Vector::Y * geometry.side).y,
+        closed_offset,
+        side: geometry.side,
     }
+}
+
+/// Moves a body, at rest.
+fn place_body(physics: &mut Physics, body: RigidBodyHandle, pose: Pose) {
+    let body = &mut physics.bodies[body];
+    body.set_position(pose, true);
+    body.set_linvel(Vector::ZERO, true);
+    body.set_angvel(Vector::ZERO, true);
 }
 
 fn weightless_body(frame: ArmFrame) -> RigidBodyBuilder {

@@ -86,7 +86,8 @@
 //! # Implementation in reading order
 //!
 //! `env` (the interface), `world` and `physics` (a rapier world for bodies of centimetres), `hand` (palm and fingers,
-//! moved by forces), `arm` and `kinematics` (the joints follow the hand by inverse kinematics), `capsule` and
+//! moved by forces), `arm` and `kinematics` (the joints of a Jaco follow the hand by inverse kinematics), `mico` (a Mico's
+//! posture, in closed form), `capsule` and
 //! `link_avoidance` (a velocity damper between the links of two arms), `frame`, `observation`, `start` (initial states),
 //! `scene` and `description` (the world as data).
 #![warn(missing_docs)]
@@ -101,6 +102,7 @@ mod frame;
 mod hand;
 mod kinematics;
 mod link_avoidance;
+mod mico;
 mod observation;
 mod parameters;
 mod physics;

@@ -3,8 +3,17 @@
 use rapier3d::math::Vector;
 use tandem_core::World;
 
-use crate::hand::{GripperGeometry, MICO_GRIPPER, THREE_FINGERS};
+use crate::hand::{HandGeometry, MICO_HAND, THREE_FINGERS};
 use crate::reach::Reach;
+
+/// A kind of arm, which moves a hand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ArmKind {
+    /// Kinova's Jaco with six joints. Its hand points straight down.
+    Jaco,
+    /// Kinova's Mico with four joints. Its hand tilts.
+    Mico,
+}
 
 /// The constants of a world.
 #[derive(Debug)]
@@ -15,6 +24,8 @@ pub(crate) struct WorldParameters {
     pub(crate) approach_gain_per_s: f32,
     /// Largest speed of the palm, metres per second.
     pub(crate) max_speed_mps: Option<f32>,
+    /// The kind of arms.
+    pub(crate) arms: ArmKind,
     /// Position of the arm's base, arm frame, metres: at the height of the table.
     pub(crate) base_in_arm: Vector,
     /// Lower corner of the end effector's workspace, arm frame, metres.
@@ -24,7 +35,7 @@ pub(crate) struct WorldParameters {
     /// The part of this box that the arm reaches; all of it if there is none.
     pub(crate) reach: Option<&'static Reach>,
     /// Fingers and pads.
-    pub(crate) gripper: &'static GripperGeometry,
+    pub(crate) gripper: &'static HandGeometry,
     /// Largest force of the palm's servo along each axis, newtons.
     pub(crate) palm_force_n: f32,
 }
@@ -33,6 +44,7 @@ static CLASSIC: WorldParameters = WorldParameters {
     control_steps_per_s: 25.0,
     approach_gain_per_s: 27.0,
     max_speed_mps: None,
+    arms: ArmKind::Jaco,
     base_in_arm: Vector::new(-0.40, 0.0, 0.0),
     workspace_low: Vector::new(-0.20, -0.25, 0.022),
     workspace_high: Vector::new(0.20, 0.25, 0.35),
@@ -48,11 +60,12 @@ static SHARED: WorldParameters = WorldParameters {
     control_steps_per_s: 4.0,
     approach_gain_per_s: 16.0,
     max_speed_mps: Some(0.2),
-    base_in_arm: Vector::new(-0.30, 0.0, 0.0),
+    arms: ArmKind::Mico,
+    base_in_arm: Vector::new(-World::Shared.mico_base_distance_m(), 0.0, 0.0),
     workspace_low: Vector::new(-0.06, -0.22, 0.031),
     workspace_high: Vector::new(0.27, 0.22, 0.33),
     reach: Some(&Reach::MICO),
-    gripper: &MICO_GRIPPER,
+    gripper: &MICO_HAND,
     palm_force_n: 40.0,
 };
 
@@ -63,6 +76,7 @@ static SLOW: WorldParameters = WorldParameters {
     control_steps_per_s: 4.0,
     approach_gain_per_s: 4.32,
     max_speed_mps: Some(0.2),
+    arms: ArmKind::Jaco,
     base_in_arm: CLASSIC.base_in_arm,
     workspace_low: CLASSIC.workspace_low,
     workspace_high: CLASSIC.workspace_high,

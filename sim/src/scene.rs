@@ -3,15 +3,16 @@
 use rapier3d::dynamics::RigidBody;
 use rapier3d::math::{Rotation, Vector};
 use tandem_core::layout::GOAL_TOLERANCE_M;
-use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
+use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 use tandem_core::{ArmIndex, Layout};
+use tandem_kinematics::{Joints, MICO_4, PADS_AHEAD_M, ToolTarget, WorkCell};
 
 use crate::arm::Arm;
 use crate::bar::{HALF_LENGTH_M, HANDLE_M, PLATE_HALF_M, SECTION_HALF_M, handle};
-use crate::capsule::{LINK_FRAMES, LINK_RADII_M};
+use crate::capsule::{ArmCapsules, LINK_FRAMES, LINK_RADII_M};
 use crate::frame::MAX_ARMS;
-use crate::hand::{PALM_ABOVE_M, PALM_HALF_M, WRIST_ABOVE_M, WRIST_RADIUS_M};
-use crate::kinematics::ForwardKinematics;
+use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
+use crate::kinematics::{ForwardKinematics, JointAngles};
 use crate::world::{TABLE_HALF_M, World};
 
 /// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand
@@ -62,34 +63,65 @@ fn bar_boxes(bar: &RigidBody) -> Vec<Cuboid> {
 }
 
 fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
-    let joint_angles_rad = arm.angles_now(&world.physics, ITERATIONS);
-    let forward = ForwardKinematics::new(&joint_angles_rad);
-    let joint_points: Vec<Point> =
-        (0..7).map(|idx| arm.world_from_base(forward.point(idx)).to_array()).collect();
     let end_effector = arm.hand.end_effector(&world.physics);
-    let mut links: Vec<Capsule> = LINK_FRAMES
-        .windows(2)
-        .zip(LINK_RADII_M)
-        .map(|(ends, radius_m)| Capsule {
-            from: joint_points[ends[0]],
-            to: joint_points[ends[1]],
-            radius_m,
-        })
-        .collect();
-    let [from, to] = WRIST_ABOVE_M.map(|above_m| (end_effector + Vector::Z * above_m).to_array());
-    links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });
-    let orientation = arm.frame.orientation_in_world();
-    let mut hand = vec![cuboid(end_effector + Vector::Z * PALM_ABOVE_M, orientation, PALM_HALF_M)];
+    let orientation = arm.hand.orientation(&world.physics);
+    let (joint_angles_rad, joint_points, links) = match arm.mico_joints(&world.physics) {
+        Some(joints) => {
+            let points = [joints.shoulder, joints.elbow.0, joints.wrist.0];
+            let [shoulder, elbow, wrist] = points.map(|point| arm.frame.world_from_arm(point));
+            let base = arm.frame.world_from_arm(arm.parameters.base_in_arm);
+            let links = ArmCapsules::of(arm, &world.physics).links();
+            let angles = mico_angles(arm, end_effector, orientation);
+            (angles, vec![base, shoulder, elbow, wrist, end_effector], links.to_vec())
+        }
+        None => jaco_scene(world, arm, end_effector),
+    };
+    let palm = &arm.parameters.gripper.palm;
+    let palm_centre = end_effector + orientation * (Vector::Z * palm.behind_m);
+    let mut hand = vec![cuboid(palm_centre, orientation, palm.half)];
     let pad_half = arm.parameters.gripper.pad_half;
     hand.extend(arm.hand.pads(&world.physics).map(|pad| cuboid(pad, orientation, pad_half)));
     ArmScene {
         base: arm.frame.world_from_arm(arm.parameters.base_in_arm).to_array(),
         joint_angles_rad,
-        joint_points,
+        joint_points: joint_points.into_iter().map(|point| point.to_array()).collect(),
         links,
         hand,
         end_effector: end_effector.to_array(),
     }
+}
+
+/// Returns the joint angles of a Jaco (radians), the positions of its joints, and its links and wrist, for the current
+/// position of its hand; world frame, metres.
+fn jaco_scene(
+    world: &World,
+    arm: &Arm,
+    end_effector: Vector,
+) -> (JointAngles, Vec<Vector>, Vec<Capsule>) {
+    let angles = arm.angles_now(&world.physics, ITERATIONS);
+    let forward = ForwardKinematics::new(&angles);
+    let points: Vec<Vector> = (0..7).map(|idx| arm.world_from_base(forward.point(idx))).collect();
+    let link = |(ends, radius_m): (&[usize], f32)| Capsule {
+        from: points[ends[0]].to_array(),
+        to: points[ends[1]].to_array(),
+        radius_m,
+    };
+    let mut links: Vec<Capsule> = LINK_FRAMES.windows(2).zip(LINK_RADII_M).map(link).collect();
+    let [from, to] = WRIST_ABOVE_M.map(|above_m| (end_effector + Vector::Z * above_m).to_array());
+    links.push(Capsule { from, to, radius_m: WRIST_RADIUS_M });
+    (angles, points, links)
+}
+
+/// Returns the joint angles of a Mico, radians, and 0 for joints that it does not have. A hand that was pushed out of
+/// reach shows the elbow's usual place.
+fn mico_angles(arm: &Arm, end_effector: Vector, orientation: Rotation) -> JointAngles {
+    let in_base = arm.frame.arm_from_world(end_effector) - arm.parameters.base_in_arm;
+    let behind = arm.frame.rotate(orientation * Vector::Z).as_dvec3() * PADS_AHEAD_M;
+    let position_m = (in_base.as_dvec3() + behind).to_array().into();
+    let target = ToolTarget { position_m, yaw_rad: WorkCell::FINGERS_YAW_RAD };
+    let elbow_up = Joints::new(MICO_4.elbow_up_rad);
+    let angles = MICO_4.inverse_kinematics(&target, &elbow_up).map_or(elbow_up, |at| at.angles);
+    std::array::from_fn(|joint| angles.get(joint).copied().unwrap_or(0.0))
 }
 
 fn cuboid(centre: Vector, orientation: Rotation, half_extents_m: Vector) -> Cuboid {

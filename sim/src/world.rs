@@ -271,8 +271,8 @@ impl World {
     fn update_gripping(&mut self) {
         let bar = self.physics.bodies[self.objects[0]].colliders();
         for (arm, gripping) in self.arms.iter().zip(&mut self.gripping) {
-            let presses = |outward: f32| {
-                let pads = arm.hand.fingers.iter().filter(|finger| finger.outward == outward);
+            let presses = |side: f32| {
+                let pads = arm.hand.fingers.iter().filter(|finger| finger.side == side);
                 let pads: Vec<ColliderHandle> = pads.map(|finger| finger.pad).collect();
                 let touches =
                     |pad| bar.iter().any(|part| self.physics.presses(pad, *part, GRIPPING_N));

@@ -246,8 +246,12 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
             for arm in 0..n_arms {
                 let of_hand = arm * OBSERVATION_PER_ARM + 6..arm * OBSERVATION_PER_ARM + 9;
                 let slip_m = distance(&before[of_hand.clone()], &observation[of_hand]);
-                // Pads meet a turned bar at an angle and settle.
-                let most_m = if layout.task.shares_object() { 5e-3 } else { 2e-3 };
+                // Pads meet a turned bar, or an upright cube in a tilted hand, at an angle and settle.
+                let most_m = match layout.task {
+                    task if task.shares_object() => 5e-3,
+                    Task::SharedPickAndPlace => 4e-3,
+                    _ => 2e-3,
+                };
                 assert!(slip_m < most_m, "seed {seed}: slipped by {slip_m} m");
                 let object_z = layout.achieved_goal_of(ArmIndex(arm)).end - 1;
                 // A hand near the ceiling of its workspace cannot rise.

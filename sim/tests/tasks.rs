@@ -127,7 +127,8 @@ fn two_scripted_arms_that_take_turns_solve_most_of_300_starts_in_the_shared_worl
 fn check_shared_starts_of_two_arms(n_episodes: u64) {
     for task in Task::SHARED {
         let layout = Layout::new(task, 2);
-        let n_steps = layout.description().episode_steps;
+        // The script takes turns, so it needs more time than an episode where both ways are long.
+        let n_steps = 2 * layout.description().episode_steps;
         let mut episodes = play_in_turn(layout, &WorldConfig::default(), n_episodes, n_steps);
         let unsolved: Vec<usize> =
             (0..episodes.len()).filter(|&idx| !episodes[idx].0.success).collect();
@@ -140,6 +141,8 @@ fn check_shared_starts_of_two_arms(n_episodes: u64) {
             unsolved.len(),
             episodes.len()
         );
+        let late = episodes.iter().filter(|(_, after)| 2 * after > n_steps).count();
+        println!("{task}: {late} not within an episode");
         // A simple script gives up where its arm has to go around the other one; a start may be solvable all the same.
         assert!(unsolved.len() * 20 <= episodes.len() + 20, "{task}: {unsolved:?}");
     }

@@ -4,12 +4,10 @@ use glam::DVec3;
 use tandem_bridge::work_cell::check_settings;
 use tandem_core::World;
 use tandem_kinematics::{
-    ForwardKinematics, Joints, MICO_4, PlacedArm, TaskFrame, ToolTarget, WorkCell,
+    ForwardKinematics, Joints, MICO_4, PADS_AHEAD_M, PlacedArm, TaskFrame, ToolTarget, WorkCell,
 };
 use tandem_sim::reach::Reach;
 
-/// The distance of the point between the pads ahead of the tool's origin, metres.
-const PADS_AHEAD_M: f64 = 0.021;
 /// Iterations that find the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 6;
 /// The end effector's range along x and y, arm frame, metres.

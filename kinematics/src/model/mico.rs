@@ -29,6 +29,9 @@ const TOOL_AXES: UnitQuaternion<f64> = half_turn(FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0
 
 const TOOL_Z_M: f64 = -0.16;
 
+/// The distance of the point between the finger pads ahead of the tool's origin, metres.
+pub const PADS_AHEAD_M: f64 = 0.021;
+
 /// Speed of joints 1 to 3 and of joint 4, radians per second.
 const SPEED_NEAR: f64 = 36.0_f64.to_radians();
 const SPEED_FAR: f64 = 48.0_f64.to_radians();

@@ -11,6 +11,7 @@ use tandem_core::rng::{bernoulli, uniform};
 use tandem_core::{ArmIndex, Layout, World, WorldSettings};
 
 use crate::frame::ArmFrame;
+use crate::mico::Mico;
 use crate::parameters::WorldParameters;
 use crate::reach::Reach;
 use crate::start::{ArmStart, all_pairs, horizontal};
@@ -51,6 +52,7 @@ struct Sampler {
     object_half_m: f32,
     grasped: bool,
     parameters: &'static WorldParameters,
+    mico: Mico,
 }
 
 /// An object's positions at the start and at its goal, world frame, metres.
@@ -71,7 +73,8 @@ pub(super) fn sample(
     let parameters = WorldParameters::of(World::Shared);
     let can_hold = layout.task.grasps() && object_half_m < parameters.gripper.max_opening_m;
     let grasped = bernoulli(rng, settings.grasped_start_prob) && can_hold;
-    let sampler = Sampler { layout, object_half_m, grasped, parameters };
+    let mico = Mico::in_shared_world();
+    let sampler = Sampler { layout, object_half_m, grasped, parameters, mico };
     loop {
         let arms: Vec<ArmStart> = layout.arms().map(|_| sampler.arm_start(rng)).collect();
         if sampler.is_valid(&arms) {
@@ -90,7 +93,7 @@ impl Sampler {
                 end_effector,
                 opening_m: self.object_half_m,
                 object,
-                object_yaw_rad: 0.0,
+                object_yaw_rad: self.grasped_yaw_rad(end_effector),
                 goal,
             };
         }
@@ -167,6 +170,12 @@ impl Sampler {
         let offset_z_m = uniform(rng, -offset_z_m, offset_z_m);
         let z_m = (hand.z + offset_z_m).max(self.object_half_m);
         Vector::new(hand.x + offset_x_m, hand.y, z_m)
+    }
+
+    /// Returns the rotation about the vertical axis of a cube between the pads of a hand, radians.
+    fn grasped_yaw_rad(&self, hand: Vector) -> f32 {
+        let closing = self.mico.posture(hand).orientation() * Vector::Y;
+        libm::atan2f(-closing.x, closing.y)
     }
 
     /// Returns the opening of each side of an empty gripper, metres.

@@ -16,13 +16,11 @@
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout};
-use tandem_kinematics::{Joints, PlacedArm, ReachError, TaskFrame, WorkCell};
+use tandem_kinematics::{Joints, PADS_AHEAD_M, PlacedArm, ReachError, TaskFrame, WorkCell};
 
 use crate::simulated::{Block, MAX_OPENING_M, ObjectPose};
 use crate::trial::training_hand::TrainingHand;
 
-/// The distance from the tool's origin to the point between the pads, metres.
-pub const PADS_AHEAD_M: f64 = 0.021;
 /// The smallest height of the point between the pads above the table, metres.
 pub const PADS_LOWEST_M: f64 = 0.031;
 /// The gap between an arm's parts and the table that hands keep, metres; more than the check requires.
