@@ -6,9 +6,8 @@ use scripted::bar::{Carriers, Imprecision, Moment, carry};
 use scripted::pair::play_in_turn;
 use scripted::{play, success_rate};
 use tandem_core::layout::GOAL_TOLERANCE_M;
-use tandem_core::rng::uniform;
-use tandem_core::{ArmIndex, Contacts, Layout, Stream, Task, WorldSettings, episode_rng};
-use tandem_sim::{Env, Friction, WorldConfig};
+use tandem_core::{Contacts, Layout, Task};
+use tandem_sim::{Friction, WorldConfig};
 
 #[test]
 fn a_scripted_arm_solves_either_classic_task() {
@@ -68,47 +67,6 @@ fn check_shared_starts_of_one_arm(n_episodes: u64) {
         let rate = success_rate(&episodes);
         println!("{task}, 1 arm: {rate}, median miss {:.4} m", median_miss_m(&episodes));
         assert!(rate == 1.0, "{task}: {rate}");
-    }
-}
-
-/// The description of the shared tasks says below which distances of their hands two arms are in contact.
-#[test]
-fn hands_nearer_than_the_described_distances_are_in_contact() {
-    for task in Task::SHARED {
-        let layout = Layout::new(task, 2);
-        let description = layout.description();
-        let &[along, across, up] = &description.contact_distances[..] else { panic!("described") };
-        let mut env = Env::new(layout, &WorldConfig::default()).expect("a valid world");
-        let (mut observation, mut n_near) = (vec![0.0; layout.n_observation()], 0);
-        for episode in 0..24 {
-            let mut rng = episode_rng(21, episode, Stream::Reset);
-            env.reset(&mut rng, WorldSettings::default());
-            for step_idx in 0..description.episode_steps {
-                env.observe(&mut observation);
-                let mut action = vec![0.0; layout.n_action()];
-                for arm in layout.arms() {
-                    let hand = &observation[layout.observation_of(arm)][..3];
-                    let part = &mut action[layout.action_of(arm)];
-                    // Both hands wander around the middle between the arms, low above the table.
-                    let to_middle = 0.5 * description.origin_distance - hand[0];
-                    part[0] = 8.0_f32.mul_add(to_middle, uniform(&mut rng, -1.0, 1.0));
-                    part[1] = (-8.0_f32).mul_add(hand[1], uniform(&mut rng, -1.0, 1.0));
-                    part[2] = 2.0_f32.mul_add(0.1 - hand[2], uniform(&mut rng, -1.0, 1.0));
-                }
-                let contacts = env.step(&action).expect("finite");
-                env.observe(&mut observation);
-                let [first, second] = [ArmIndex(0), ArmIndex(1)]
-                    .map(|arm| &observation[layout.observation_of(arm)][..3]);
-                let dx = (description.origin_distance - first[0] - second[0]).abs();
-                let dy = (first[1] + second[1]).abs();
-                if dx < along && dy < across && (first[2] - second[2]).abs() < up {
-                    n_near += 1;
-                    let is_contact = contacts.contains(Contacts::ARM_ARM);
-                    assert!(is_contact, "{task}, episode {episode}, step {step_idx}: {dx}, {dy}");
-                }
-            }
-        }
-        assert!(n_near >= 5, "{task}: {n_near} steps");
     }
 }
 

@@ -16,11 +16,6 @@ use crate::layout::{
 const RECOMBINATION_GAP_M: f32 = 0.10;
 /// The same in the plane, in the shared world: a hand is at most 0.12 m wide and moves up to 0.05 m per step.
 const SHARED_RECOMBINATION_GAP_M: f32 = 0.16;
-/// Distances along x, y and z below which two hands of the shared world are in contact. They are somewhat smaller than
-/// those of all hands that touch: what has these distances certainly does.
-const SHARED_CONTACT_DISTANCES_M: [f32; 3] = [0.065, 0.08, 0.15];
-/// Position of each arm's base, arm frame, metres: the simulator's.
-const BASE_X_M: f32 = -0.30;
 
 /// Number of steps for which a bar must be held at its goal.
 const CARRIED_STEPS: usize = 5;
@@ -83,12 +78,8 @@ impl Layout {
             } else {
                 RECOMBINATION_GAP_M
             }),
-            base: if is_shared { if_several(BASE_X_M) } else { 0.0 },
-            contact_distances: if is_shared && is_recombined {
-                SHARED_CONTACT_DISTANCES_M.to_vec()
-            } else {
-                Vec::new()
-            },
+            base: if is_shared { if_several(-World::Shared.mico_base_distance_m()) } else { 0.0 },
+            contact_distances: Vec::new(),
             observation_bound: (0..self.n_observation())
                 .map(|idx| self.observation_bound(idx))
                 .collect(),

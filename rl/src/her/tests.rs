@@ -353,9 +353,13 @@ fn arms_of_different_steps_are_combined_where_they_cannot_meet() {
 #[test]
 fn steps_after_which_hands_would_overlap_make_a_contact() {
     let layout = Layout::new(Task::SharedPush, 2);
+    let mut description = layout.description();
+    description.name = "described-contacts".to_owned();
+    description.contact_distances = vec![0.065, 0.08, 0.15];
+    let task = TaskSpec::new(description).unwrap();
     // Each arm has its hand in the middle in one episode, and far back in the other.
     let episode_of = |number: u64, in_middle: usize| {
-        let mut episode = Episode::zeros(layout, number);
+        let mut episode = Episode::zeros(task.clone(), number);
         episode.goal.fill(9.0);
         episode.actions.fill(0.1 * number as f32);
         episode.advised_arms.fill(0b11);
@@ -368,7 +372,7 @@ fn steps_after_which_hands_would_overlap_make_a_contact() {
         }
         episode
     };
-    let mut buffer = ReplayBuffer::new(layout, 1000);
+    let mut buffer = ReplayBuffer::new(task.clone(), 1000);
     buffer.push(&episode_of(0, 0));
     buffer.push(&episode_of(1, 1));
     let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
@@ -384,9 +388,9 @@ fn steps_after_which_hands_would_overlap_make_a_contact() {
             contact_foresight_steps: 3,
             ..config(RewardKind::PerArm)
         };
-        let mut batch = Batch::new(layout, 2, 400);
+        let mut batch = Batch::new(task.clone(), 2, 400);
         let mut rng = episode_rng(3, 0, Stream::Replay);
-        Sampler::new(&config, layout).fill(&buffer, statistics, &mut rng, &mut batch);
+        Sampler::new(&config, task.clone()).fill(&buffer, statistics, &mut rng, &mut batch);
         let rows = batch.actions.chunks_exact(6).zip(batch.bc_mask.chunks_exact(6));
         let touches =
             rows.zip(batch.rewards.chunks_exact(2)).map(|((action, bc_mask), rewards)| {
