@@ -17,13 +17,18 @@ use tandem_telemetry::ContactMetrics;
 use crate::cli::ReportArgs;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{film, output, policy_file};
+use crate::{film, output, policy_file, run_file};
 
 /// Number of test goals for the evaluation of composed teachers, as for `tandem eval` and at the end of a run.
 const TEST_EPISODES: u64 = 240;
 
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
-    let inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
+    let mut inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
+    for run in &mut inputs.runs {
+        // Runs of one configuration form a group, whichever version wrote their files.
+        let completed = run.configuration.as_deref().and_then(run_file::completed);
+        run.configuration = completed.or(run.configuration.take());
+    }
     let trials = Trials::of(inputs.trials);
     warn(inputs.warnings.iter().chain(&trials.warnings));
     let mut comparison = {

@@ -56,6 +56,12 @@ pub(crate) fn to_text(config: &RunConfig) -> Result<String, Failed> {
     Ok(format!("# tandem {}\n{text}", crate::version::VERSION))
 }
 
+/// Returns the run file `text` of any version with every setting of this one, or `None` if it is not a valid run file.
+pub(crate) fn completed(text: &str) -> Option<String> {
+    let config = overlay(parse(text).ok()?, &[]).ok()?;
+    to_toml(&config).ok()
+}
+
 /// Writes the configuration with every setting atomically.
 pub(crate) fn save(config: &RunConfig, path: &Path) -> Result<(), Failed> {
     let written = atomic_file::replace(path, to_text(config)?.as_bytes());

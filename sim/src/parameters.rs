@@ -38,6 +38,9 @@ pub(crate) struct WorldParameters {
     pub(crate) gripper: &'static HandGeometry,
     /// Largest force of the palm's servo along each axis, newtons.
     pub(crate) palm_force_n: f32,
+    /// Force on an object from above, newtons, that counts as a contact with the table, if any does. Arms whose torques are
+    /// supervised stop at such a force.
+    pub(crate) press_limit_n: Option<f32>,
 }
 
 static CLASSIC: WorldParameters = WorldParameters {
@@ -51,6 +54,7 @@ static CLASSIC: WorldParameters = WorldParameters {
     reach: None,
     gripper: &THREE_FINGERS,
     palm_force_n: 40.0,
+    press_limit_n: None,
 };
 
 /// The gain covers 91 % of a displacement of 5 cm within a control step, and 98 % of a short one. The workspace's floor
@@ -67,6 +71,7 @@ static SHARED: WorldParameters = WorldParameters {
     reach: Some(&Reach::MICO),
     gripper: &MICO_HAND,
     palm_force_n: 40.0,
+    press_limit_n: Some(10.0),
 };
 
 /// A step covers the same share of a displacement as in the classic world, so a policy of that world can act here. Two
@@ -83,6 +88,7 @@ static SLOW: WorldParameters = WorldParameters {
     reach: None,
     gripper: &THREE_FINGERS,
     palm_force_n: 10.0,
+    press_limit_n: None,
 };
 
 impl WorldParameters {

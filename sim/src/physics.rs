@@ -142,6 +142,26 @@ impl Physics {
         pair.map_or(0.0, impulse) > force_n * self.substep_s()
     }
 
+    /// Returns the forces with which the hands of both arms pressed objects down in the last physics step, newtons. Friction
+    /// is excluded.
+    pub(crate) fn downward_forces_n(&self) -> [f32; 2] {
+        let group =
+            |collider: ColliderHandle| self.colliders[collider].collision_groups().memberships;
+        let is_object = |collider| OBJECTS.contains(&group(collider));
+        let mut impulses = [0.0; 2];
+        for pair in self.narrow_phase.contact_pairs() {
+            for (arm, impulse) in impulses.iter_mut().enumerate() {
+                // The impulse acts on the second collider.
+                if group(pair.collider1) == HANDS[arm] && is_object(pair.collider2) {
+                    *impulse -= pair.total_impulse().z;
+                } else if group(pair.collider2) == HANDS[arm] && is_object(pair.collider1) {
+                    *impulse += pair.total_impulse().z;
+                }
+            }
+        }
+        impulses.map(|impulse| impulse / self.substep_s())
+    }
+
     /// Classifies a contact of this pair.
     fn kind_of(&self, pair: &ContactPair) -> Contacts {
         let group =

@@ -241,6 +241,11 @@ impl World {
             self.drive(if substep < self.delay_substeps { &previous } else { commands });
             self.physics.step();
             contacts = contacts | self.physics.hand_contacts();
+            if let Some(limit_n) = self.parameters.press_limit_n
+                && self.physics.downward_forces_n().iter().any(|force_n| *force_n > limit_n)
+            {
+                contacts = contacts | Contacts::ARM_TABLE;
+            }
             if self.has_bar {
                 self.update_gripping();
             }

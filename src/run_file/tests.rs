@@ -179,6 +179,24 @@ fn a_complete_file_of_an_earlier_version_keeps_its_meaning() {
 }
 
 #[test]
+fn the_file_of_an_earlier_version_is_completed_for_comparisons() {
+    let config = RunConfig::defaults(Recipe::Tandem, Task::CarryBar, 2);
+    let written = to_toml(&config).expect("writes");
+    let mut former: Table = written.parse().expect("TOML");
+    for (key, _) in former_keys::ADDED {
+        let (section, name) = key.split_once('.').expect("in a section");
+        former[section].as_table_mut().expect("a section").remove(name);
+    }
+    let mut expected = config.clone();
+    expected.replay.reflection_prob = 0.0;
+    expected.evaluation.early_points = 0;
+    let completed = completed(&former.to_string()).expect("valid");
+    assert_eq!(completed, to_toml(&expected).expect("writes"));
+    assert_eq!(self::completed("arms = 0"), None);
+    assert_eq!(self::completed("not TOML ="), None);
+}
+
+#[test]
 fn every_run_file_that_ships_is_valid() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy");
     let files = std::fs::read_dir(directory).expect("ships").flatten().map(|entry| entry.path());
