@@ -14,8 +14,10 @@ use crate::arm::Arm;
 use crate::capsule::{ArmCapsules, N_CAPSULES, N_LINKS, closest_fractions};
 use crate::physics::Physics;
 
-/// Number of pairs of capsules with at least one link. Wrists, palms and fingers collide with each other in rapier.
-const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
+/// Number of pairs of capsules of two hands, which collide with each other in rapier.
+const N_HAND_PAIRS: usize = (N_CAPSULES - N_LINKS) * (N_CAPSULES - N_LINKS);
+/// Number of pairs of capsules with at least one link.
+const N_PAIRS: usize = N_CAPSULES * N_CAPSULES - N_HAND_PAIRS;
 
 /// Largest approach speed of an arm per metre of gap, 1/s.
 pub(crate) const APPROACH_GAIN: f32 = 20.0;
@@ -74,17 +76,24 @@ struct Limits {
 pub(crate) struct VelocityDamper {
     arms: [ArmCapsules; 2],
     pairs: [Pair; N_PAIRS],
+    /// The pairs whose gaps are measured and impose no limits; none unless hands are watched.
+    hand_pairs: Option<[Pair; N_HAND_PAIRS]>,
     min_gap_m: f32,
+    min_hand_gap_m: f32,
     n_interventions: u32,
 }
 
 impl VelocityDamper {
-    /// Creates a damper for `arms` at their current positions.
-    pub(crate) fn new(arms: [&Arm; 2], physics: &Physics) -> Self {
+    /// Creates a damper for `arms` at their current positions. It measures gaps between hands as well if it
+    /// `watches_hands`.
+    pub(crate) fn new(arms: [&Arm; 2], physics: &Physics, watches_hands: bool) -> Self {
         let mut damper = Self {
             arms: arms.map(|arm| ArmCapsules::of(arm, physics)),
-            pairs: all_pairs(),
+            pairs: pairs(|capsules| capsules.iter().any(|capsule| *capsule < N_LINKS)),
+            hand_pairs: watches_hands
+                .then(|| pairs(|capsules| capsules.iter().all(|capsule| *capsule >= N_LINKS))),
             min_gap_m: f32::INFINITY,
+            min_hand_gap_m: f32::INFINITY,
             n_interventions: 0,
         };
         damper.update_posture(arms, physics);
@@ -95,12 +104,26 @@ impl VelocityDamper {
     pub(crate) fn update_posture(&mut self, arms: [&Arm; 2], physics: &Physics) {
         self.arms = arms.map(|arm| ArmCapsules::of(arm, physics));
         self.min_gap_m = f32::INFINITY;
+        self.min_hand_gap_m = f32::INFINITY;
         self.n_interventions = 0;
         let palms = self.arms.map(|arm| arm.palm_position);
         for pair in &mut self.pairs {
             let gap_m = pair.update(&self.arms, palms).gap_m;
             pair.active = gap_m < ACTIVATION_DISTANCE_M;
             self.min_gap_m = self.min_gap_m.min(gap_m);
+        }
+        self.measure_hands(palms);
+    }
+
+    /// Returns the smallest gap between hands since the start of the control step, metres; infinite if they are not
+    /// watched.
+    pub(crate) fn min_hand_gap_m(&self) -> f32 {
+        self.min_hand_gap_m
+    }
+
+    fn measure_hands(&mut self, palms: [Vector; 2]) {
+        for pair in self.hand_pairs.iter_mut().flatten() {
+            self.min_hand_gap_m = self.min_hand_gap_m.min(pair.update(&self.arms, palms).gap_m);
         }
     }
 
@@ -114,6 +137,7 @@ impl VelocityDamper {
     ///
     /// `palms` are the current positions of the palms, world frame, metres.
     pub(crate) fn limit(&mut self, palms: [Vector; 2], desired: [Vector; 2]) -> [Vector; 2] {
+        self.measure_hands(palms);
         let mut limits = [Limits::none(), Limits::none()];
         for pair in self.pairs.iter_mut().filter(|pair| pair.active) {
             let proximity = pair.update(&self.arms, palms);
@@ -223,13 +247,11 @@ impl Limit {
     }
 }
 
-/// Returns all pairs of capsules with at least one link.
-fn all_pairs() -> [Pair; N_PAIRS] {
-    let mut pairs = [Pair { capsules: [0, 0], normal: None, active: false }; N_PAIRS];
-    let with_link = (0..N_CAPSULES)
-        .flat_map(|first| (0..N_CAPSULES).map(move |second| [first, second]))
-        .filter(|capsules| capsules.iter().any(|capsule| *capsule < N_LINKS));
-    for (pair, capsules) in pairs.iter_mut().zip(with_link) {
+/// Returns the pairs of capsules that `belongs` selects, of which there are `N`.
+fn pairs<const N: usize>(belongs: impl Fn(&[usize; 2]) -> bool) -> [Pair; N] {
+    let mut pairs = [Pair { capsules: [0, 0], normal: None, active: false }; N];
+    let all = (0..N_CAPSULES).flat_map(|first| (0..N_CAPSULES).map(move |second| [first, second]));
+    for (pair, capsules) in pairs.iter_mut().zip(all.filter(belongs)) {
         pair.capsules = capsules;
     }
     pairs
@@ -258,7 +280,7 @@ mod tests {
             capsules: [capsule(y_m, along); N_CAPSULES],
         };
         let arms = [arm(0.1, Vector::X), arm(0.0, Vector::Z)];
-        let mut pair = all_pairs()[0];
+        let mut pair = pairs::<N_PAIRS>(|_| true)[0];
         let gaps: Vec<f32> = (0_u8..16)
             .map(|step| {
                 let proximity =

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rapier3d::math::Vector;
 use tandem_core::rng::{standard_normal, uniform};
-use tandem_core::{ArmIndex, Task};
+use tandem_core::{ArmIndex, Task, World};
 
 use crate::config::{Friction, WorldConfig};
 use crate::frame::MAX_ARMS;
@@ -26,6 +26,10 @@ const PLACE_ERROR_M: f32 = 0.002;
 /// Standard deviation of the error that changes with each step along each axis, metres.
 const PLACE_NOISE_M: f32 = 0.001;
 
+/// Gap between two arms of the shared world below which they count as touching, metres: up to the gap that the check of the
+/// bridge demands. An arm cannot know it, so it expects the more contacts the nearer it comes to the other one.
+const CONTACT_MARGIN_M: [f32; 2] = [0.0, 0.02];
+
 /// The properties of one episode's world.
 pub(crate) struct Episode {
     pub(crate) object_half_m: f32,
@@ -33,6 +37,7 @@ pub(crate) struct Episode {
     pub(crate) friction: Friction,
     pub(crate) table_friction: f32,
     pub(crate) delay_s: f32,
+    pub(crate) contact_margin_m: f32,
 }
 
 /// Errors of the observed positions of objects.
@@ -60,7 +65,11 @@ impl Episode {
         let factor = between(1.0, SURFACES) * table_friction / config.table_friction;
         let friction = Friction { pads: nominal.pads * factor, object: nominal.object * factor };
         let delay_s = between(0.0, DELAY_S);
-        Self { object_half_m, object_mass_kg, friction, table_friction, delay_s }
+        let contact_margin_m = match task.world() {
+            World::Shared => between(0.0, CONTACT_MARGIN_M),
+            World::Classic | World::Slow => 0.0,
+        };
+        Self { object_half_m, object_mass_kg, friction, table_friction, delay_s, contact_margin_m }
     }
 }
 

@@ -41,9 +41,12 @@ pub(crate) struct World {
     /// Present if there are two arms.
     damper: Option<VelocityDamper>,
     substeps: u32,
+    /// Gap between two arms, hands included, below which they count as touching, metres; 0 if only bodies that press on each
+    /// other and links that overlap do.
+    contact_margin_m: f32,
     /// Physics steps at the start of a control step in which the previous command is still executed.
     delay_substeps: u32,
-    previous: [Command; MAX_ARMS],
+    pub(crate) previous: [Command; MAX_ARMS],
     pub(crate) parameters: &'static WorldParameters,
     pub(crate) control_step_s: f32,
 }
@@ -75,6 +78,7 @@ impl World {
             gripping: [false; MAX_ARMS],
             damper: None,
             substeps: config.substeps_in(kind),
+            contact_margin_m: 0.0,
             delay_substeps: 0,
             previous: [Command { target: Vector::ZERO, gripper: 0.0 }; MAX_ARMS],
             parameters: WorldParameters::of(kind),
@@ -149,6 +153,7 @@ impl World {
         )]
         let delay_substeps = (episode.delay_s / self.physics.substep_s()) as u32;
         self.delay_substeps = delay_substeps;
+        self.contact_margin_m = episode.contact_margin_m;
     }
 
     /// Makes the arms stay where they are, with grippers as they are, until the first action takes effect.
@@ -164,7 +169,10 @@ impl World {
     /// Starts link avoidance anew. To be called once all arms are in place.
     pub(crate) fn reset_link_avoidance(&mut self) {
         self.damper = match self.arms.as_slice() {
-            [first, second] => Some(VelocityDamper::new([first, second], &self.physics)),
+            [first, second] => {
+                let watches_hands = self.contact_margin_m > 0.0;
+                Some(VelocityDamper::new([first, second], &self.physics, watches_hands))
+            }
             _ => None,
         };
     }
@@ -251,7 +259,8 @@ impl World {
             }
         }
         self.check_finite()?;
-        if self.link_gap_m() < 0.0 {
+        let hand_gap_m = self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_hand_gap_m);
+        if self.link_gap_m().min(hand_gap_m) < self.contact_margin_m {
             contacts = contacts | Contacts::ARM_ARM;
         }
         Ok(contacts)

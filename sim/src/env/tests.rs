@@ -137,6 +137,29 @@ fn a_hand_that_presses_a_cube_onto_the_table_touches_the_table_in_the_shared_wor
     assert_eq!(contacts_of_a_move(Task::SharedPush, beside, Vector::X), Contacts::NONE);
 }
 
+#[test]
+fn hands_that_come_near_touch_in_a_world_with_a_margin() {
+    let contacts_at = |contact_margin_m, apart_m: f32| {
+        let config = WorldConfig::default();
+        let mut world = World::build(Layout::new(Task::SharedPush, 2), &config);
+        let mut rng = episode_rng(1, 0, Stream::Reset);
+        let nominal = Episode::draw(&mut rng, Task::SharedPush, &config, 0.0);
+        world.vary(&Episode { contact_margin_m, ..nominal });
+        for arm in [ARM, ArmIndex(1)] {
+            world.place_arm(arm, Vector::new(0.12 - 0.5 * apart_m, 0.0, 0.1), 0.0);
+            world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225), 0.0);
+        }
+        world.reset_link_avoidance();
+        world.hold();
+        let hold = world.previous;
+        world.step(&hold).unwrap()
+    };
+    // The capsules of the fingers have a radius of 3.5 cm.
+    assert_eq!(contacts_at(0.02, 0.085), Contacts::ARM_ARM);
+    assert_eq!(contacts_at(0.01, 0.085), Contacts::NONE);
+    assert_eq!(contacts_at(0.0, 0.06), Contacts::NONE, "the pads are apart");
+}
+
 /// For each step the 90th percentiles over episodes of the differences that swapping the arms and that displacing
 /// the objects by a tenth of a micrometre make, metres.
 fn differences_m(task: Task, n_episodes: u64) -> Vec<[f32; 2]> {
