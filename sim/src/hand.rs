@@ -144,8 +144,9 @@ impl Hand {
         let turn = self.orientation_at(at);
         place_body(physics, self.palm, Pose::from_parts(at, turn));
         for finger in self.driven_fingers() {
-            let in_palm = finger.closed_offset + Vector::Y * (finger.side * opening_m);
-            place_body(physics, finger.body, Pose::from_parts(at + turn * in_palm, turn));
+            let outward = turn * (Vector::Y * (finger.side * opening_m));
+            let placed = at + turn * finger.closed_offset + outward;
+            place_body(physics, finger.body, Pose::from_parts(placed, turn));
         }
     }
 
@@ -303,9 +304,25 @@ impl Hand {
                 .clamp(-FINGER_HOLD_FORCE_N, FINGER_HOLD_FORCE_N);
             let closing_n = finger.side * (2.0 * finger.mass_fraction * side_force_n + balancing_n);
             let held = bounded(lateral, FINGER_HOLD_FORCE_N);
-            *force_n = palm.orientation * Vector::new(held.x, closing_n, held.z);
+            *force_n = self.world_from_palm(palm, Vector::new(held.x, closing_n, held.z));
         }
         forces_n
+    }
+
+    /// Rotates a direction from the world frame to the palm's. Signs alone change for upright hands, also those of zeros.
+    fn palm_from_world(&self, palm: PalmMotion, direction: Vector) -> Vector {
+        match self.settings.mico {
+            None => self.frame.rotate(direction),
+            Some(_) => palm.orientation.inverse() * direction,
+        }
+    }
+
+    /// Rotates a direction from the palm's frame to the world frame.
+    fn world_from_palm(&self, palm: PalmMotion, direction: Vector) -> Vector {
+        match self.settings.mico {
+            None => self.frame.rotate(direction),
+            Some(_) => palm.orientation * direction,
+        }
     }
 
     /// Returns the fingers that are separate bodies.
@@ -323,14 +340,13 @@ impl Hand {
         palm: PalmMotion,
     ) -> [FingerState; N_OBSERVED_FINGERS] {
         let palm_position = self.end_effector(physics);
-        let palm_from_world = palm.orientation.inverse();
         let mut states = [FingerState::default(); N_OBSERVED_FINGERS];
         for (finger, state) in self.fingers.iter().zip(&mut states) {
             let body = &physics.bodies[finger.body];
             let lever = body.translation() - palm_position;
             let carried = palm.velocity + palm.angular_velocity.cross(lever);
-            let offset = palm_from_world * lever - finger.closed_offset;
-            let velocity = palm_from_world * (body.linvel() - carried);
+            let offset = self.palm_from_world(palm, lever) - finger.closed_offset;
+            let velocity = self.palm_from_world(palm, body.linvel() - carried);
             *state = FingerState {
                 opening_m: offset.y * finger.side,
                 opening_rate_mps: velocity.y * finger.side,
