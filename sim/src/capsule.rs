@@ -1,6 +1,5 @@
 //! Capsules that approximate an arm's shape for link avoidance, and their motion with the palm.
 
-use rapier3d::glamx::DVec3;
 use rapier3d::math::{Matrix, Vector};
 use serde::Serialize;
 use tandem_core::scene::Capsule;
@@ -9,7 +8,7 @@ use tandem_kinematics::{MICO_4, PADS_AHEAD_M};
 
 use crate::arm::Arm;
 use crate::hand::{Gripper, HandSettings, WRIST_ABOVE_M, WRIST_RADIUS_M};
-use crate::mico::JointPoints;
+use crate::mico::{JointPoints, single};
 use crate::physics::Physics;
 
 /// Link frames of a Jaco whose origins are the ends of the links' capsules.
@@ -184,10 +183,6 @@ pub(crate) fn describe_mico_capsules(settings: &HandSettings) -> Capsules {
         shell_end_m: shell_end_m.to_array(),
         finger_ends_m: fingers_m.map(|end| end.to_array()),
     }
-}
-
-fn single(value: f64) -> f32 {
-    DVec3::splat(value).as_vec3().x
 }
 
 impl ArmCapsule {

@@ -200,7 +200,8 @@ fn difference(angle: [f32; 2], [sin, cos]: [f32; 2]) -> [f32; 2] {
     sum(angle, [-sin, cos])
 }
 
-fn single(value: f64) -> f32 {
+/// Converts to the single precision of the simulation.
+pub(crate) fn single(value: f64) -> f32 {
     DVec3::splat(value).as_vec3().x
 }
 

@@ -46,7 +46,7 @@ pub(crate) struct World {
     contact_margin_m: f32,
     /// Physics steps at the start of a control step in which the previous command is still executed.
     delay_substeps: u32,
-    pub(crate) previous: [Command; MAX_ARMS],
+    previous: [Command; MAX_ARMS],
     pub(crate) parameters: &'static WorldParameters,
     pub(crate) control_step_s: f32,
 }

@@ -150,9 +150,9 @@ fn hands_that_come_near_touch_in_a_world_with_a_margin() {
             world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225), 0.0);
         }
         world.reset_link_avoidance();
-        world.hold();
-        let hold = world.previous;
-        world.step(&hold).unwrap()
+        let stay = world.arms.iter().map(|arm| arm.hand.end_effector(&world.physics));
+        let commands: Vec<Command> = stay.map(|target| Command { target, gripper: -1.0 }).collect();
+        world.step(&[commands[0], commands[1]]).unwrap()
     };
     // The capsules of the fingers have a radius of 3.5 cm.
     assert_eq!(contacts_at(0.02, 0.085), Contacts::ARM_ARM);
