@@ -52,7 +52,7 @@ impl Arm {
         let settings = HandSettings {
             gripper: if task.grasps() { Gripper::Driven } else { Gripper::Locked },
             geometry: parameters.gripper,
-            pad_friction: config.friction(task).pads,
+            surfaces: config.surfaces(task),
             grip_force_n: config.grip_force_n,
             palm_force_n: parameters.palm_force_n,
             mico: match parameters.arms {

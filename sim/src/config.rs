@@ -28,6 +28,9 @@ pub struct WorldConfig {
     pub pick_and_place: Friction,
     /// Friction in the task to carry a bar.
     pub carry_bar: Friction,
+    /// Coulomb friction coefficient of a Mico's pads in the shared world, in [0, 2]. Their tips have the coefficient that
+    /// the task's friction gives to pads.
+    pub rubber_pads: f32,
 }
 
 /// Coulomb friction coefficients, each in [0, 2]. A contact has the larger coefficient of its two surfaces, so that of
@@ -39,6 +42,16 @@ pub struct Friction {
     pub pads: f32,
     /// Coefficient of the cubes.
     pub object: f32,
+}
+
+/// The Coulomb friction coefficients of a task's pads and objects.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Surfaces {
+    /// Of the pads, above their tips.
+    pub(crate) sides: f32,
+    /// Of the pads' lower ends, which press on what is below them.
+    pub(crate) tips: f32,
+    pub(crate) object: f32,
 }
 
 impl Default for WorldConfig {
@@ -53,6 +66,7 @@ impl Default for WorldConfig {
             push: Friction { pads: 0.3, object: 0.3 },
             pick_and_place: Friction { pads: 0.45, object: 0.45 },
             carry_bar: Friction { pads: 0.8, object: 0.8 },
+            rubber_pads: 0.8,
         }
     }
 }
@@ -85,6 +99,7 @@ impl WorldConfig {
         check("pick_and_place.object", self.pick_and_place.object.into(), 0.0, 2.0)?;
         check("carry_bar.pads", self.carry_bar.pads.into(), 0.0, 2.0)?;
         check("carry_bar.object", self.carry_bar.object.into(), 0.0, 2.0)?;
+        check("rubber_pads", self.rubber_pads.into(), 0.0, 2.0)?;
         Ok(self)
     }
 
@@ -111,12 +126,14 @@ impl WorldConfig {
     }
 
     /// Returns the friction coefficients for `task`.
-    pub(crate) fn friction(&self, task: Task) -> Friction {
-        match task {
+    pub(crate) fn surfaces(&self, task: Task) -> Surfaces {
+        let Friction { pads, object } = match task {
             Task::CarryBar => self.carry_bar,
             _ if task.grasps() => self.pick_and_place,
             _ => self.push,
-        }
+        };
+        let sides = if task.world() == World::Shared { self.rubber_pads } else { pads };
+        Surfaces { sides, tips: pads, object }
     }
 }
 

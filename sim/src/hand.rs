@@ -18,6 +18,7 @@ use tandem_core::ArmIndex;
 
 use self::geometry::{FingerGeometry, PalmGeometry};
 pub(crate) use self::geometry::{HandGeometry, MICO_HAND, N_OBSERVED_FINGERS, THREE_FINGERS};
+use crate::config::Surfaces;
 use crate::frame::ArmFrame;
 use crate::mico::Mico;
 use crate::physics::{Part, Physics, collides};
@@ -53,7 +54,7 @@ pub(crate) enum Gripper {
 pub(crate) struct HandSettings {
     pub(crate) gripper: Gripper,
     pub(crate) geometry: &'static HandGeometry,
-    pub(crate) pad_friction: f32,
+    pub(crate) surfaces: Surfaces,
     pub(crate) grip_force_n: f32,
     pub(crate) palm_force_n: f32,
     /// The arm whose posture tilts the hand; hands without one point straight down.
@@ -87,6 +88,8 @@ pub(crate) struct Finger {
     /// The palm's body if the gripper is locked.
     pub(crate) body: RigidBodyHandle,
     pub(crate) pad: ColliderHandle,
+    /// The lower end of the pad, if it differs from the rest.
+    pub(crate) tip: Option<ColliderHandle>,
     pub(crate) mass_kg: f32,
     /// Fraction of the mass of all fingers, and weight in the mean opening.
     pub(crate) mass_fraction: f32,
@@ -407,19 +410,28 @@ fn add_finger(
     let pad_half = settings.geometry.pad_half;
     let closed_offset = Vector::new(geometry.x_m, geometry.side * pad_half.y, 0.0);
     let is_weightless = settings.mico.is_some() && settings.gripper == Gripper::Locked;
-    let pad = ColliderBuilder::cuboid(pad_half.x, pad_half.y, pad_half.z)
-        .mass(if is_weightless { 0.0 } else { geometry.mass_kg })
-        .friction(settings.pad_friction)
-        .friction_combine_rule(CoefficientCombineRule::Max)
-        .collision_groups(collides(Part::Hand, arm));
-    let pad = match settings.gripper {
-        Gripper::Locked => pad.translation(closed_offset),
-        Gripper::Driven => pad,
+    let centre = match settings.gripper {
+        Gripper::Locked => closed_offset,
+        Gripper::Driven => Vector::ZERO,
     };
-    let pad = physics.colliders.insert_with_parent(pad, body, &mut physics.bodies);
+    let mass_kg = if is_weightless { 0.0 } else { geometry.mass_kg };
+    let mut add = |[low_m, high_m]: [f32; 2], friction: f32| {
+        let part = ColliderBuilder::cuboid(pad_half.x, pad_half.y, 0.5 * (high_m - low_m))
+            .translation(centre + Vector::Z * (0.5 * (low_m + high_m)))
+            .mass(mass_kg * ((high_m - low_m) / (2.0 * pad_half.z)))
+            .friction(friction)
+            .friction_combine_rule(CoefficientCombineRule::Max)
+            .collision_groups(collides(Part::Hand, arm));
+        physics.colliders.insert_with_parent(part, body, &mut physics.bodies)
+    };
+    let [low_m, high_m] = [-pad_half.z, pad_half.z];
+    let border_m = low_m + settings.geometry.tip_height_m;
+    let pad = add([border_m, high_m], settings.surfaces.sides);
+    let tip = (border_m > low_m).then(|| add([low_m, border_m], settings.surfaces.tips));
     Finger {
         body,
         pad,
+        tip,
         mass_kg: geometry.mass_kg,
         mass_fraction: geometry.mass_kg / FINGERS_MASS_KG,
         closed_offset,

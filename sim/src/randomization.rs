@@ -7,7 +7,7 @@ use rapier3d::math::Vector;
 use tandem_core::rng::{standard_normal, uniform};
 use tandem_core::{ArmIndex, Task, World};
 
-use crate::config::{Friction, WorldConfig};
+use crate::config::{Surfaces, WorldConfig};
 use crate::frame::MAX_ARMS;
 
 /// Edge of the cubes, metres.
@@ -16,8 +16,8 @@ const OBJECT_EDGE_M: [f32; 2] = [0.045, 0.065];
 const OBJECT_MASS_KG: [f32; 2] = [0.05, 0.20];
 /// Friction of the table.
 const TABLE: [f32; 2] = [0.4, 0.8];
-/// Friction of pads and cubes as a multiple of the configured one, at the configured friction of the table. What presses
-/// from above has less friction than the table, so it cannot drag a cube.
+/// Friction of pads and cubes as a multiple of the configured one, at the configured friction of the table. The tips of
+/// pads, which press from above, have less friction than the table, so they cannot drag a cube.
 const SURFACES: [f32; 2] = [0.7, 1.25];
 /// Time until an action takes effect, seconds.
 const DELAY_S: [f32; 2] = [0.0, 0.040];
@@ -34,7 +34,7 @@ const CONTACT_MARGIN_M: [f32; 2] = [0.0, 0.02];
 pub(crate) struct Episode {
     pub(crate) object_half_m: f32,
     pub(crate) object_mass_kg: f32,
-    pub(crate) friction: Friction,
+    pub(crate) surfaces: Surfaces,
     pub(crate) table_friction: f32,
     pub(crate) delay_s: f32,
     pub(crate) contact_margin_m: f32,
@@ -57,19 +57,23 @@ impl Episode {
         let mut between = |nominal: f32, [low, high]: [f32; 2]| {
             nominal + share * (uniform(rng, low, high) - nominal)
         };
-        let nominal = config.friction(task);
+        let nominal = config.surfaces(task);
         let object_half_m =
             between(config.object_half_size_m, OBJECT_EDGE_M.map(|edge| 0.5 * edge));
         let object_mass_kg = between(config.object_mass_kg, OBJECT_MASS_KG);
         let table_friction = between(config.table_friction, TABLE);
         let factor = between(1.0, SURFACES) * table_friction / config.table_friction;
-        let friction = Friction { pads: nominal.pads * factor, object: nominal.object * factor };
+        let surfaces = Surfaces {
+            sides: nominal.sides * factor,
+            tips: nominal.tips * factor,
+            object: nominal.object * factor,
+        };
         let delay_s = between(0.0, DELAY_S);
         let contact_margin_m = match task.world() {
             World::Shared => between(0.0, CONTACT_MARGIN_M),
             World::Classic | World::Slow => 0.0,
         };
-        Self { object_half_m, object_mass_kg, friction, table_friction, delay_s, contact_margin_m }
+        Self { object_half_m, object_mass_kg, surfaces, table_friction, delay_s, contact_margin_m }
     }
 }
 
@@ -106,7 +110,7 @@ mod tests {
     use tandem_core::{Stream, episode_rng};
 
     #[test]
-    fn draws_stay_in_their_ranges_and_pads_have_less_friction_than_the_table() {
+    fn draws_stay_in_their_ranges_and_tips_have_less_friction_than_the_table() {
         let config = WorldConfig::default();
         for (task, number) in
             Task::ALL.into_iter().flat_map(|task| (0..500).map(move |n| (task, n)))
@@ -120,7 +124,7 @@ mod tests {
             assert!(within(episode.delay_s, DELAY_S));
             // A bar has rough handles.
             let can_drag = task.shares_object();
-            assert!(can_drag || episode.friction.pads < episode.table_friction);
+            assert!(can_drag || episode.surfaces.tips < episode.table_friction);
         }
     }
 
@@ -131,7 +135,7 @@ mod tests {
         let episode = Episode::draw(&mut rng, Task::SharedPush, &config, 0.0);
         assert_eq!(episode.object_half_m, config.object_half_size_m);
         assert_eq!(episode.object_mass_kg, config.object_mass_kg);
-        assert_eq!(episode.friction, config.push);
+        assert_eq!(episode.surfaces, config.surfaces(Task::SharedPush));
         assert_eq!((episode.table_friction, episode.delay_s), (config.table_friction, 0.0));
     }
 }

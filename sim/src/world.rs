@@ -54,7 +54,7 @@ pub(crate) struct World {
 impl World {
     /// Creates a world whose bodies have not been placed yet.
     pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
-        let friction = config.friction(layout.task);
+        let friction = config.surfaces(layout.task);
         let kind = layout.task.world();
         let mut physics = Physics::new(config, kind);
         let mut arms = Vec::with_capacity(layout.n_arms);
@@ -130,11 +130,14 @@ impl World {
                     part.set_shape(SharedShape::cuboid(half_m, half_m, half_m));
                     part.set_mass(episode.object_mass_kg);
                 }
-                part.set_friction(episode.friction.object);
+                part.set_friction(episode.surfaces.object);
             }
         }
         for finger in self.arms.iter().flat_map(|arm| &arm.hand.fingers) {
-            self.physics.colliders[finger.pad].set_friction(episode.friction.pads);
+            self.physics.colliders[finger.pad].set_friction(episode.surfaces.sides);
+            if let Some(tip) = finger.tip {
+                self.physics.colliders[tip].set_friction(episode.surfaces.tips);
+            }
         }
         let tables: Vec<ColliderHandle> = self
             .physics

@@ -2,7 +2,7 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use tandem_core::{AdviceUnit, Exploration, JudgedAction, Task, TaskSpec, WorldSettings};
+use tandem_core::{AdviceUnit, Exploration, JudgedAction, Task, TaskSpec, World, WorldSettings};
 
 use super::{
     AdviceConfig, Behaviour, BudgetScope, CheckpointConfig, EvaluationConfig, PolyakEvery,
@@ -61,7 +61,7 @@ impl RunConfig {
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
                 share: if tandem { 0.5 } else { 1.0 },
             },
-            rounds: rounds(recipe),
+            rounds: rounds(recipe, layout),
             exploration: Exploration {
                 noise_std: 0.2,
                 random_action_prob: 0.3,
@@ -101,13 +101,17 @@ impl RunConfig {
     }
 }
 
-const fn rounds(recipe: Recipe) -> RoundsConfig {
+fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
     match recipe {
         Recipe::Tandem => RoundsConfig {
             slots: 8,
             rollouts: 2,
             lag: 1,
-            updates_per_env_step: 0.5,
+            updates_per_env_step: if is_shared(layout) && layout.n_arms() == 1 {
+                0.25
+            } else {
+                0.5
+            },
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
             per_epoch: 50,
@@ -124,12 +128,24 @@ const fn rounds(recipe: Recipe) -> RoundsConfig {
     }
 }
 
+/// Returns whether the task is a built-in one of the world `shared`.
+fn is_shared(layout: &TaskSpec) -> bool {
+    layout.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
+}
+
 /// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
 /// after 43 and 898.
 fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
     let max_env_steps = match (recipe, layout.as_built_in()) {
         (Recipe::Paper, _) if layout.n_arms() == 1 => 50 * PAPER_EPOCH_ENV_STEPS,
         (Recipe::Paper, _) => 900 * PAPER_EPOCH_ENV_STEPS,
+        (Recipe::Tandem, Some(built_in)) if is_shared(layout) => {
+            match (built_in.n_arms, built_in.task.grasps()) {
+                (1, false) => 100_000,
+                (1, true) => 200_000,
+                _ => 400_000,
+            }
+        }
         (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
         (Recipe::Tandem, _) => 300_000,
     };
@@ -138,7 +154,8 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
 
 fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
     let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
-    let starts_grasped = recipe == Recipe::Tandem && grasps;
+    let tandem = recipe == Recipe::Tandem;
+    let starts_grasped = tandem && grasps;
     let shares_object = layout.shares_object();
     WorldSettings {
         grasped_start_prob: match starts_grasped {
@@ -147,6 +164,7 @@ fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
             false => 0.0,
         },
         grasped_start_env_steps: if starts_grasped && shares_object { 150_000 } else { 0 },
+        randomization: if tandem && is_shared(layout) { 1.0 } else { 0.0 },
         ..WorldSettings::default()
     }
 }
@@ -168,8 +186,9 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         joint_goal_statistics: !tandem,
         // Four fifths of the tolerance; of 0.05 m exactly 0.04 m.
         goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
-        contact_cost: if avoids_contacts { 1.0 } else { 0.0 },
-        contact_cost_growth: 1.0,
+        // One arm of the shared world learns not to press.
+        contact_cost: if avoids_contacts || (tandem && is_shared(layout)) { 1.0 } else { 0.0 },
+        contact_cost_growth: if avoids_contacts && is_shared(layout) { 8.0 } else { 1.0 },
         contact_foresight_steps: if avoids_contacts { 5.min(layout.episode_steps()) } else { 0 },
     }
 }

@@ -35,6 +35,8 @@ pub(crate) struct HandGeometry {
     pub(super) observed: [usize; N_OBSERVED_FINGERS],
     /// Half extents of a finger pad (x, closing direction, z), metres.
     pub(crate) pad_half: Vector,
+    /// Height of the pads' lower ends whose friction differs from that of the rest, metres; 0 if pads are of one piece.
+    pub(crate) tip_height_m: f32,
     /// Largest opening of each side of the gripper, metres.
     pub(crate) max_opening_m: f32,
     /// Speed of each side at full gripper input, metres per second.
@@ -52,6 +54,7 @@ pub(crate) static THREE_FINGERS: HandGeometry = HandGeometry {
     ],
     observed: [0, 1, 2],
     pad_half: Vector::new(0.010, 0.010, 0.020),
+    tip_height_m: 0.0,
     max_opening_m: 0.040,
     opening_speed_mps: 0.25,
 };
@@ -70,6 +73,7 @@ pub(crate) static MICO_HAND: HandGeometry = HandGeometry {
     ],
     observed: [0, 0, 1],
     pad_half: Vector::new(0.008, 0.005, 0.015),
+    tip_height_m: 0.003,
     max_opening_m: 0.062,
     opening_speed_mps: 0.062,
 };
