@@ -68,6 +68,7 @@ fn unusable_arguments_are_reported_in_one_line() {
     check(&["--policy", STUDENT, "--task", "pick-and-place"], 64, "is for push");
     check(&["--policy", STUDENT, "--block-cm", "20"], 64, "expected 3 to 9");
     check(&["--policy", STUDENT, "--speed", "2"], 64, "at most 1");
+    check(&["--policy", STUDENT, "--pad-friction", "nan"], 64, "expected 0 to 2");
     let bar = ["--composed-teachers", GRASPING_TEACHER, "--task", "carry-bar"];
     check(&[&bar[..], &["--block-cm", "5"]].concat(), 64, "keeps its size");
     check(&["--composed-teachers", TEACHER, "--task", "carry-bar"], 64, "not for carry-bar");

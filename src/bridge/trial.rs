@@ -11,7 +11,7 @@ use tandem_policy::policy::RANDOMIZATION_KEY;
 use tandem_report::{Comparison, PlottedTrials, report_html};
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
-use tandem_trials::simulated::Block;
+use tandem_trials::simulated::{Block, GripperConfig};
 use tandem_trials::trial::mapping::TRAINED_HALF_M;
 use tandem_trials::trial::{TrialConfig, TrialError, TrialMode, TrialReport};
 use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
@@ -42,6 +42,11 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
         let message = format!("--speed {}: expected more than 0 and at most 1", args.speed);
         return Err(Failed::usage(message));
     }
+    if !(0.0..=2.0).contains(&args.pad_friction) {
+        let message = format!("--pad-friction {}: expected 0 to 2", args.pad_friction);
+        return Err(Failed::usage(message));
+    }
+    let gripper = GripperConfig { pad_friction: args.pad_friction, ..GripperConfig::default() };
     let all_modes = [ModeName::ClosedLoop, ModeName::Twin, ModeName::OpenLoop];
     let modes = if args.modes.is_empty() { &all_modes[..] } else { &args.modes };
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
@@ -61,7 +66,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 trained_half_m: trained_half_m(policy, &block),
                 seed: args.seed,
                 speed: args.speed,
-                simulated: SimulatedConfig::default(),
+                simulated: SimulatedConfig { gripper, ..SimulatedConfig::default() },
                 time_limit_s: TIME_LIMIT_S,
             };
             let series = Series { policy, config };

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use tandem_trials::simulated::GripperConfig;
 
 use crate::cli::{TaskName, WorldName};
 
@@ -49,6 +50,9 @@ pub(crate) struct TrialArgs {
     /// [default: 5.6].
     #[arg(long)]
     pub(crate) block_cm: Option<f32>,
+    /// Coulomb friction of the grippers' pads, 0 to 2. Blocks have 0.5, and a contact has the larger of both.
+    #[arg(long, value_name = "COEFFICIENT", default_value_t = GripperConfig::default().pad_friction)]
+    pub(crate) pad_friction: f32,
     /// Trials to record to MCAP files.
     #[arg(long, value_enum, default_value_t = RecordName::Failures)]
     pub(crate) record: RecordName,
