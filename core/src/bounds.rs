@@ -3,7 +3,7 @@
 //! A number beyond its bound cannot come from a correct simulation. It would distort the running statistics that
 //! normalise every later input, so the learner refuses episodes that contain one. The bounds leave room for everything
 //! that can happen in an episode, such as an object that falls off the table in the 2 s of the classic world. In the
-//! shared world, whose hands are slow, objects stay on the table.
+//! shared world objects fall to a floor.
 
 use crate::layout::{Layout, OBSERVATION_PER_ARM, World};
 

@@ -16,6 +16,10 @@ use crate::randomization::Episode;
 
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
+/// Height of the floor, world frame, metres.
+pub(crate) const FLOOR_M: f32 = -0.75;
+/// Half extents of the floor, metres.
+const FLOOR_HALF_M: Vector = Vector::new(8.0, 8.0, 0.5);
 
 /// Force of a pad above which it presses on the bar, newtons.
 const GRIPPING_N: f32 = 0.5;
@@ -69,6 +73,11 @@ impl World {
         }
         if layout.task.shares_object() {
             objects.push(bar::build(&mut physics, friction.object));
+        }
+        if kind == tandem_core::World::Shared {
+            for arm in layout.arms() {
+                add_floor(&mut physics, arm, config.table_friction);
+            }
         }
         Self {
             physics,
@@ -328,6 +337,16 @@ fn add_table(physics: &mut Physics, arm: ArmIndex, frame: ArmFrame, friction: f3
         .friction_combine_rule(CoefficientCombineRule::Min)
         .collision_groups(collides(Part::Table, arm));
     physics.colliders.insert(table);
+}
+
+/// Adds the floor below the table, for `arm`'s object: an episode of the shared world is long enough for a fall of 760 m.
+fn add_floor(physics: &mut Physics, arm: ArmIndex, friction: f32) {
+    let floor = ColliderBuilder::cuboid(FLOOR_HALF_M.x, FLOOR_HALF_M.y, FLOOR_HALF_M.z)
+        .translation(Vector::Z * (FLOOR_M - FLOOR_HALF_M.z))
+        .friction(friction)
+        .friction_combine_rule(CoefficientCombineRule::Min)
+        .collision_groups(collides(Part::Table, arm));
+    physics.colliders.insert(floor);
 }
 
 fn add_object(

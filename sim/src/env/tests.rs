@@ -195,6 +195,25 @@ fn differences_m(task: Task, n_episodes: u64) -> Vec<[f32; 2]> {
         .collect()
 }
 
+#[test]
+fn objects_that_leave_the_shared_table_fall_to_the_floor() {
+    let layout = Layout::new(Task::SharedPickAndPlace, 2);
+    let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
+    let mut rng = episode_rng(3, 0, Stream::Reset);
+    let half_m = env.config.object_half_size_m;
+    let mut starts = sample_starts(&mut rng, layout, half_m, WorldSettings::default());
+    for start in &mut starts {
+        start.object = Vector::new(1.2, 0.0, 0.1);
+    }
+    let noise = vec![vec![0.0; layout.n_action()]; tandem_core::layout::EPISODE_STEPS];
+    let observations = observations(&mut env, &starts, &noise);
+    for arm in layout.arms() {
+        let object_z = layout.observation_of(arm).start + 5;
+        let (fallen, last) = (observations[30][object_z], observations[noise.len() - 1][object_z]);
+        assert!(last < -0.7 && (fallen - last).abs() < 1e-3, "{fallen}, {last}");
+    }
+}
+
 /// Contacts amplify rounding errors, so the symmetry is exact only before the first contact. After it, swapping
 /// changes a trajectory about as much as a displacement of the objects by 0.1 µm does. A control step of the shared
 /// world has four times as many physics steps, so that a grasped object amplifies errors to a tenth of a millimetre
