@@ -188,7 +188,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
         // One arm of the shared world learns not to press.
         contact_cost: if avoids_contacts || (tandem && is_shared(layout)) { 1.0 } else { 0.0 },
-        contact_cost_growth: if avoids_contacts && is_shared(layout) { 8.0 } else { 1.0 },
+        contact_cost_growth: if avoids_contacts && is_shared(layout) { 3.0 } else { 1.0 },
         contact_foresight_steps: if avoids_contacts { 5.min(layout.episode_steps()) } else { 0 },
     }
 }
