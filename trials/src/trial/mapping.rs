@@ -27,6 +27,9 @@ pub const PADS_LOWEST_M: f64 = 0.031;
 pub const TABLE_GAP_M: f64 = 0.006;
 /// Half the edge of the training world's blocks unless their sizes vary, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
+/// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above the
+/// table, metres.
+const WITHDRAWN_M: [f64; 2] = [-0.05, 0.20];
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
@@ -204,6 +207,19 @@ impl Mapping {
             object: self.object_in_own(arm, seen.at_m),
             turn: upright * seen.turn * upright.inverse(),
         }
+    }
+
+    /// Returns the nearest position to `hand` that the training world's hand may have; own frame, metres.
+    #[must_use]
+    pub fn reachable_hand(&self, hand: DVec3) -> DVec3 {
+        self.hand.reachable(hand)
+    }
+
+    /// Returns a position to which the hand of `arm` withdraws to make room for other arms: near its own base and above
+    /// the objects on the table; own frame, metres.
+    #[must_use]
+    pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
+        self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))
     }
 
     /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1,

@@ -1,7 +1,8 @@
 //! Motions that are executed without observing the objects.
 
+use glam::DVec3;
 use tandem_core::ArmIndex;
-use tandem_kinematics::{Joints, Motion, Reason, Refusal, Waypoint};
+use tandem_kinematics::{ArmWaypoint, Joints, Motion, Reason, Refusal, Waypoint};
 
 use crate::trial::coordination::coordinated;
 use crate::trial::outcome::{FailureCause, MotionRefusal};
@@ -9,6 +10,11 @@ use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::TrialRig;
 use crate::trial::runner::{REST_S, STEP_GAP_M, TrialExecution, TrialRunner};
 use crate::trial::{ActionSource, TrialError};
+
+/// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
+const N_WITHDRAWAL_STEPS: usize = 10;
+/// Height by which a hand that withdraws first rises, metres.
+const LIFT_M: f64 = 0.06;
 
 /// A motion that was planned before its execution.
 pub(super) struct PlannedMotion {
@@ -94,12 +100,64 @@ impl TrialRunner {
         if self.task.shares_object() {
             return (waypoints, motion);
         }
-        match coordinated(self.mapping.cell(), &waypoints, at, STEP_GAP_M) {
-            Some(waypoints) => {
-                let motion = self.motion(&waypoints, at, &self.check);
-                (waypoints, motion)
+        for path in [waypoints.clone(), self.with_withdrawals(&waypoints, at)] {
+            let Some(waypoints) = coordinated(self.mapping.cell(), &path, at, STEP_GAP_M) else {
+                continue;
+            };
+            let motion = self.motion(&waypoints, at, &self.check);
+            if motion.is_ok() {
+                return (waypoints, motion);
             }
-            None => (waypoints, motion),
         }
+        (waypoints, motion)
+    }
+
+    /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before it
+    /// starts and, where it holds nothing, withdraws at the end.
+    fn with_withdrawals(&self, waypoints: &[Waypoint], at: &[Joints]) -> Vec<Waypoint> {
+        let (Some(first), Some(last)) = (waypoints.first(), waypoints.last()) else {
+            return waypoints.to_vec();
+        };
+        let away = self.withdrawal(first, at);
+        let back = away.iter().rev().skip(1).cloned().chain([first.clone()]);
+        let mut path = vec![first.clone()];
+        path.extend(away.iter().cloned().chain(back));
+        path.extend(waypoints[1..].iter().cloned());
+        if !self.config.layout.task.grasps() {
+            path.extend(self.withdrawal(last, at));
+        }
+        path
+    }
+
+    /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far as
+    /// the arms reach.
+    fn withdrawal(&self, from: &Waypoint, at: &[Joints]) -> Vec<Waypoint> {
+        let way = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
+            let index = ArmIndex(arm);
+            let placed = &self.mapping.cell().arms[arm];
+            let target = placed.target(&waypoint.tool_in_world_m);
+            let Ok(solution) = placed.model.inverse_kinematics(&target, &at[arm]) else {
+                return vec![*waypoint; N_WITHDRAWAL_STEPS];
+            };
+            let hand = self.mapping.hand_in_own(index, &solution.angles);
+            let above = self.mapping.reachable_hand(hand + DVec3::Z * LIFT_M);
+            let target = self.mapping.withdrawn_hand(hand);
+            let mut last = *waypoint;
+            let step = |step: usize| {
+                let hand = match step {
+                    0 => 0.5 * (hand + above),
+                    1 => above,
+                    _ => above.lerp(target, (step - 1) as f64 / (N_WITHDRAWAL_STEPS - 2) as f64),
+                };
+                if let Ok((tool, _)) = self.mapping.tool_in_world(index, hand, &solution.angles) {
+                    last.tool_in_world_m = tool.into();
+                }
+                last
+            };
+            (0..N_WITHDRAWAL_STEPS).map(step).collect()
+        };
+        let ways: Vec<Vec<ArmWaypoint>> =
+            from.iter().enumerate().map(|(arm, waypoint)| way(arm, waypoint)).collect();
+        (0..N_WITHDRAWAL_STEPS).map(|step| ways.iter().map(|way| way[step]).collect()).collect()
     }
 }

@@ -76,7 +76,8 @@ impl TrainingHand {
     }
 
     /// Returns the nearest position to `at` that the hand may have; own frame, metres.
-    fn reachable(&self, at: DVec3) -> DVec3 {
+    #[must_use]
+    pub fn reachable(&self, at: DVec3) -> DVec3 {
         let [low, high] = self.workspace_m;
         let at = at.clamp(low, high);
         self.reach.map_or(at, |reach| reach.clamp(at.as_vec3()).as_dvec3())
