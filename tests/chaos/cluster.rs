@@ -180,14 +180,13 @@ impl Cluster {
     }
 
     fn apply(&mut self, fault: Fault) {
-        let quiet = self.undo.is_empty();
         let until = self.started.elapsed() + fault.lasts();
         self.recoveries.disturbed_by(fault);
         match fault {
             Fault::Kill(target) => {
                 self.process(target).kill();
                 self.restart(target);
-                self.measure(target, quiet);
+                self.measure(target);
             }
             Fault::Stop(target, _) => {
                 let process = self.process(target);
@@ -238,16 +237,15 @@ impl Cluster {
         process.restart();
     }
 
-    /// Measures the recovery time of a process. Workers are measured only if no other fault is active.
-    fn measure(&mut self, target: Target, quiet: bool) {
+    /// Measures the recovery time of a process.
+    fn measure(&mut self, target: Target) {
         match target {
             Target::Teacher => self.recoveries.teacher(teacher(self.teacher_at)),
             Target::Learner => self.recoveries.learner(learner(self.learner_at)),
-            Target::Worker(idx) if quiet => {
+            Target::Worker(idx) => {
                 let name = worker_name(idx, self.workers[idx].n_interruptions);
                 self.recoveries.worker(idx, name, learner(self.learner_at));
             }
-            Target::Worker(_) => (),
         }
     }
 

@@ -31,15 +31,14 @@ pub(crate) struct Recoveries {
 }
 
 impl Recoveries {
-    /// Discards the measurements that a fault invalidates: those of its target and of all workers.
+    /// Discards the measurement of the process that a fault hits.
     pub(crate) fn disturbed_by(&mut self, fault: Fault) {
         self.under_way.retain(|who, measurement| {
             let is_target = matches!(fault, Fault::Kill(hit) | Fault::Stop(hit, _) if hit == *who);
-            let is_spoilt = is_target || matches!(who, Target::Worker(_));
-            if is_spoilt {
+            if is_target {
                 measurement.abort();
             }
-            !is_spoilt
+            !is_target
         });
     }
 

@@ -79,7 +79,7 @@ const BATCH: [Kind; 12] = [
 /// Number of events in a batch, after which every kind of fault has occurred.
 pub(crate) const BATCH_EVENTS: usize = BATCH.len();
 /// Pause of all faults after a worker is killed, so that its recovery can be measured.
-const QUIET_AFTER_WORKER_KILL: Duration = Duration::from_secs(3);
+const QUIET_AFTER_WORKER_KILL: Duration = Duration::from_millis(1_500);
 /// Shortest and longest duration of a fault.
 const LASTS_MILLIS: (u64, u64) = (500, 6_000);
 
