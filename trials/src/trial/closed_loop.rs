@@ -176,7 +176,8 @@ impl TrialRunner {
         let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
-            let opening_m = self.mapping.opening_after(state.openings_m[arm.0], action);
+            let commanded_m = state.openings_m[arm.0];
+            let opening_m = self.mapping.opening_after(commanded_m, now[arm.0].opening_m, action);
             let velocity = &mut state.velocities[arm.0];
             let (hand, then) = self.mapping.hand_after(now[arm.0].hand, *velocity, action);
             *velocity = then;

@@ -229,15 +229,17 @@ impl Mapping {
         self.hand.after(hand, velocity, action)
     }
 
-    /// Returns the desired opening of each side of the gripper after a step with `action` from `opening_m`, metres.
-    /// Objects between the pads are ignored: a gripper that holds an object is commanded to close.
+    /// Returns the opening of each side of the gripper to command after a step with `action`, metres. `commanded_m` was
+    /// commanded before and `actual_m` reached. A gripper that closes is commanded beyond an object between its pads,
+    /// which presses on it; one that opens starts from the object's size, as in the training world.
     #[must_use]
-    pub fn opening_after(&self, opening_m: f64, action: &[f32]) -> f64 {
+    pub fn opening_after(&self, commanded_m: f64, actual_m: f64, action: &[f32]) -> f64 {
         if !self.layout.task.grasps() {
             return 0.0;
         }
-        let step_m = f64::from(action[3].clamp(-1.0, 1.0)) * self.hand.opening_step_m();
-        (opening_m + step_m).clamp(0.0, self.hand.max_opening_m())
+        let input = f64::from(action[3].clamp(-1.0, 1.0));
+        let from_m = if input > 0.0 { commanded_m.max(actual_m) } else { commanded_m };
+        (from_m + input * self.hand.opening_step_m()).clamp(0.0, self.hand.max_opening_m())
     }
 
     /// Writes the policy's observation of one arm, shape `[28]`, in the training world's format. Velocities follow from

@@ -38,7 +38,7 @@ impl TrialRunner {
         for step in &rollout.steps {
             for (arm, opening_m) in openings.iter_mut().enumerate() {
                 let action = &step.action[self.config.layout.action_of(ArmIndex(arm))];
-                *opening_m = self.mapping.opening_after(*opening_m, action);
+                *opening_m = self.mapping.opening_after(*opening_m, step.openings_m[arm], action);
             }
             waypoints.push(self.waypoint(&step.hands, &openings, at));
         }

@@ -31,11 +31,17 @@ pub struct TrialStart {
     pub shared: Option<SharedObject>,
 }
 
+/// Index of the first finger's opening in an arm's observation.
+const FIRST_OPENING: usize = 9;
+
 /// One step of a rollout, arm by arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RolloutStep {
     /// The end effectors after the step, own frames, metres.
     pub hands: Vec<DVec3>,
+    /// The openings of the grippers before the step, of each side, metres. A gripper that holds an object is open as wide
+    /// as that.
+    pub openings_m: Vec<f64>,
     /// The actions of all arms, shape `[n_action]`.
     pub action: Vec<f32>,
 }
@@ -136,10 +142,11 @@ impl Rehearsal {
             self.env.observe(&mut observation);
             let mut action = vec![0.0; self.layout.n_action()];
             policy.act(&observation, &goal, &mut action);
+            let openings_m = self.openings_m(&observation);
             contacts = contacts | self.env.step(&action)?;
             self.env.observe(&mut observation);
             let hands = self.points(&observation, 0);
-            steps.push(RolloutStep { hands, action });
+            steps.push(RolloutStep { hands, openings_m, action });
         }
         let distance = |(at, goal): (DVec3, DVec3)| (at - goal).length();
         let objects = self.above_rest(self.points(&observation, 3));
@@ -161,6 +168,12 @@ impl Rehearsal {
             goals: self.goals(),
             shared: self.shared_object(),
         }
+    }
+
+    /// The openings of the grippers, metres.
+    fn openings_m(&self, observation: &[f32]) -> Vec<f64> {
+        let of_arm = |arm: ArmIndex| &observation[self.layout.observation_of(arm)];
+        self.layout.arms().map(|arm| f64::from(of_arm(arm)[FIRST_OPENING])).collect()
     }
 
     /// The point at index `first` of each arm's observation.
