@@ -28,8 +28,8 @@ pub struct WorldConfig {
     pub pick_and_place: Friction,
     /// Friction in the task to carry a bar.
     pub carry_bar: Friction,
-    /// Coulomb friction coefficient of a Mico's pads in the shared world, in [0, 2]. Their tips have the coefficient that
-    /// the task's friction gives to pads.
+    /// Coulomb friction coefficient of the pads in the shared world's push task, in [0, 2]. Their tips have the coefficient
+    /// that `push` gives to pads.
     pub rubber_pads: f32,
 }
 
@@ -132,7 +132,8 @@ impl WorldConfig {
             _ if task.grasps() => self.pick_and_place,
             _ => self.push,
         };
-        let sides = if task.world() == World::Shared { self.rubber_pads } else { pads };
+        let is_rubber = task.world() == World::Shared && !task.grasps();
+        let sides = if is_rubber { self.rubber_pads } else { pads };
         Surfaces { sides, tips: pads, object }
     }
 }

@@ -425,7 +425,10 @@ fn add_finger(
         physics.colliders.insert_with_parent(part, body, &mut physics.bodies)
     };
     let [low_m, high_m] = [-pad_half.z, pad_half.z];
-    let border_m = low_m + settings.geometry.tip_height_m;
+    let border_m = match settings.gripper {
+        Gripper::Locked => low_m + settings.geometry.tip_height_m,
+        Gripper::Driven => low_m,
+    };
     let pad = add([border_m, high_m], settings.surfaces.sides);
     let tip = (border_m > low_m).then(|| add([low_m, border_m], settings.surfaces.tips));
     Finger {

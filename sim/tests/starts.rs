@@ -248,7 +248,8 @@ fn grasped_starts_keep_holding_while_the_hand_moves() {
                 let slip_m = distance(&before[of_hand.clone()], &observation[of_hand]);
                 // Pads meet a turned bar, or an upright cube in a tilted hand, at an angle and settle.
                 let most_m = match layout.task {
-                    task if task.shares_object() || task == Task::SharedPickAndPlace => 5e-3,
+                    task if task.shares_object() => 5e-3,
+                    Task::SharedPickAndPlace => 4e-3,
                     _ => 2e-3,
                 };
                 assert!(slip_m < most_m, "seed {seed}: slipped by {slip_m} m");
