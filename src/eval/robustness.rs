@@ -133,6 +133,7 @@ fn conditions(task: Task) -> Vec<Condition> {
 fn with_friction(factor: f32) -> WorldConfig {
     let mut world = WorldConfig::default();
     world.table_friction *= factor;
+    world.rubber_pads *= factor;
     for friction in [&mut world.push, &mut world.pick_and_place, &mut world.carry_bar] {
         friction.pads *= factor;
         friction.object *= factor;
