@@ -17,7 +17,7 @@ use crate::randomization::Episode;
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
 /// Height of the floor, world frame, metres.
-pub(crate) const FLOOR_M: f32 = -0.75;
+const FLOOR_M: f32 = -0.75;
 /// Half extents of the floor, metres.
 const FLOOR_HALF_M: Vector = Vector::new(8.0, 8.0, 0.5);
 

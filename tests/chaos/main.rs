@@ -21,14 +21,11 @@ use std::time::Duration;
 use serde_json::Value;
 
 use cluster::{Cluster, NAME, Outcome, ledger_path, run_dir};
-use schedule::{BATCH_EVENTS, Event, Fault, Schedule, Target};
+use schedule::{BATCH_EVENTS, Schedule, Target};
 
 const N_WORKERS: usize = 4;
 /// Minimum number of faults. Faults come faster on a fast machine, so that every kind of fault occurs.
 const MIN_FAULTS_PER_RUN: u32 = 20;
-
-/// Time before the end of a run until which a killed process is expected to recover.
-const TIME_TO_RECOVER: Duration = Duration::from_secs(3);
 
 /// The size of a run and the rate of faults.
 struct Scale {
@@ -148,8 +145,8 @@ fn report(disturbed: &Outcome) {
     }
 }
 
-/// Checks that every kind of process that was killed in time recovered at least once. The durations are only printed,
-/// because they depend on the machine, and include other faults.
+/// Checks that every kind of process recovered from a kill at least once. The durations are only printed, because they
+/// depend on the machine and include other faults.
 fn check_recoveries(disturbed: &Outcome) {
     let kinds: [fn(&Target) -> bool; 3] = [
         |who| *who == Target::Teacher,
@@ -158,16 +155,7 @@ fn check_recoveries(disturbed: &Outcome) {
     ];
     for is_kind in kinds {
         let recovered = disturbed.recoveries.iter().any(|recovery| is_kind(&recovery.who));
-        let killed_in_time = |event: &Event| {
-            matches!(event.fault, Fault::Kill(who) if is_kind(&who))
-                && event.at + TIME_TO_RECOVER < disturbed.wall
-        };
-        let was_killed = disturbed.events.iter().any(killed_in_time);
-        assert!(
-            recovered || !was_killed,
-            "one kind of process never recovered: {:?}",
-            disturbed.recoveries
-        );
+        assert!(recovered, "one kind of process never recovered: {:?}", disturbed.recoveries);
     }
 }
 

@@ -35,7 +35,7 @@ pub(crate) struct HandGeometry {
     pub(super) observed: [usize; N_OBSERVED_FINGERS],
     /// Half extents of a finger pad (x, closing direction, z), metres.
     pub(crate) pad_half: Vector,
-    /// Height of a locked gripper's lower ends whose friction differs from that of the rest of the pads, metres; 0 if pads
+    /// Height of the lower end of a locked gripper's pad whose friction differs from that of the rest, metres; 0 if pads
     /// are of one piece.
     pub(crate) tip_height_m: f32,
     /// Largest opening of each side of the gripper, metres.

@@ -215,8 +215,8 @@ impl Mapping {
         self.hand.reachable(hand)
     }
 
-    /// Returns a position to which the hand of `arm` withdraws to make room for other arms: near its own base and above
-    /// the objects on the table; own frame, metres.
+    /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above the
+    /// objects on the table; own frame, metres.
     #[must_use]
     pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
         self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))

@@ -161,3 +161,58 @@ impl TrialRunner {
         (0..N_WITHDRAWAL_STEPS).map(|step| ways.iter().map(|way| way[step]).collect()).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Layout, Task};
+
+    use super::*;
+    use crate::simulated::{Block, SimulatedConfig};
+    use crate::trial::{TrialConfig, TrialMode};
+
+    fn runner(task: Task) -> TrialRunner {
+        let config = TrialConfig {
+            layout: Layout::new(task, 2),
+            mode: TrialMode::OpenLoop,
+            block: Block::small([0.0; 2]),
+            trained_half_m: 0.028,
+            seed: 1,
+            speed: 1.0,
+            simulated: SimulatedConfig::default(),
+            time_limit_s: 120.0,
+        };
+        TrialRunner::new(config).unwrap()
+    }
+
+    #[test]
+    fn a_gripper_opens_from_the_size_of_the_object_that_it_holds() {
+        let runner = runner(Task::SharedPickAndPlace);
+        let after = |commanded_m, input| {
+            runner.mapping.opening_after(commanded_m, 0.028, &[0.0, 0.0, 0.0, input])
+        };
+        assert!(after(0.0, 0.5) > 0.028, "opens in one step");
+        assert!(after(0.020, -0.5) < 0.020, "presses harder");
+        assert!((after(0.028, -1.0) - (0.028 - 0.062 * 0.25)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn arms_whose_ways_end_in_each_other_withdraw() {
+        let runner = runner(Task::SharedPush);
+        let cell = runner.mapping.cell();
+        let near = cell.ready(0.2).unwrap();
+        let at_share = |share: f64| {
+            let hand = DVec3::new(0.18 * share, 0.0, 0.05);
+            runner.waypoint(&[hand, hand], &[0.0; 2], &near).unwrap()
+        };
+        let waypoints: Vec<Waypoint> =
+            (0..=6).map(|step| at_share(f64::from(step) / 6.0)).collect();
+        let refused = runner.motion(&waypoints, &near, &runner.check);
+        assert!(matches!(refused, Err(FailureCause::Refused(MotionRefusal::Check(_)))));
+        assert_eq!(coordinated(cell, &waypoints, &near, STEP_GAP_M), None, "waiting is not enough");
+        let (path, motion) = runner.blind_motion(waypoints.clone(), &near);
+        assert!(motion.is_ok(), "{motion:?}");
+        for (arm, reached) in waypoints[6].iter().enumerate() {
+            assert!(path.iter().any(|waypoint| waypoint[arm] == *reached), "arm {arm}");
+        }
+    }
+}
