@@ -135,6 +135,7 @@ fn encode_reflection(reflection: &Reflection) -> Option<pb::Reflection> {
         moved: reflection.moved.iter().map(moved).collect(),
         position: encode_indices(&reflection.position),
         plane: reflection.plane,
+        whole_scene: reflection.whole_scene,
     })
 }
 
@@ -148,6 +149,7 @@ fn decode_reflection(reflection: pb::Reflection) -> Reflection {
         moved: reflection.moved.iter().map(moved).collect(),
         position: decode_indices(&reflection.position),
         plane: reflection.plane,
+        whole_scene: reflection.whole_scene,
     }
 }
 
@@ -242,6 +244,7 @@ mod tests {
                 moved: vec![[0, 1], [1, 0]],
                 position: vec![1],
                 plane: 0.5,
+                whole_scene: true,
             },
         })
         .unwrap()

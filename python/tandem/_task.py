@@ -102,7 +102,8 @@ class Manipulation:
 class Reflection:
     """A mirror symmetry: it turns an arm's part of a valid transition into that of another one.
 
-    With several arms it holds while the arm is far enough from the others to be recombined.
+    With several arms it holds while the arm is far enough from the others to be recombined, or always if it is that of
+    the whole scene.
 
     Places are indices within the vector of one arm: 0 is the arm's first number.
     """
@@ -119,6 +120,9 @@ class Reflection:
     """Pairs of places in an observation: the first gets the number of the second."""
     plane: float = 0.0
     """The coordinate of the mirror plane."""
+    whole_scene: bool = False
+    """Whether the arms and their links mirror each other about one plane, so that all arms of a transition can be
+    reflected at once, however near they are."""
 
     def to_message(self) -> task_pb2.Reflection:
         """Returns the message `tandem.v1.Reflection`."""
@@ -128,6 +132,7 @@ class Reflection:
             goal=self.goal,
             action=self.action,
             plane=self.plane,
+            whole_scene=self.whole_scene,
         )
         for to, place in self.moved:
             # `from` is a keyword.
@@ -145,6 +150,7 @@ class Reflection:
             tuple(message.action),
             moved,
             message.plane,
+            message.whole_scene,
         )
 
 

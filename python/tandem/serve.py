@@ -124,8 +124,8 @@ def _reflection(text: str) -> Reflection:
     try:
         given = json.loads(text)
         moved = tuple((to, place) for to, place in given.pop("moved", ()))
-        plane = float(given.pop("plane", 0.0))
-        return Reflection(**{name: tuple(places) for name, places in given.items()}, moved=moved, plane=plane)
+        places = {name: tuple(given.pop(name, ())) for name in ("observation", "position", "goal", "action")}
+        return Reflection(**places, **given, moved=moved)
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected fetch or an object as tandem.Reflection: {error}") from None
 

@@ -367,7 +367,7 @@ def test_what_arms_share_and_success_needs_is_described() -> None:
 
 
 def test_a_reflection_is_described() -> None:
-    reflection = tandem.Reflection((0,), position=(2,), goal=(1,), action=(1,), moved=((2, 3), (3, 2)), plane=0.75)
+    reflection = tandem.Reflection((0,), position=(2,), goal=(1,), action=(1,), moved=((2, 3), (3, 2)), plane=0.75, whole_scene=True)
     with tandem.EnvironmentServer((ID, {"tandem_task": {"reflection": reflection}})) as server:
         message = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
     assert (list(message.reflection.observation), list(message.reflection.goal)) == ([0], [1])

@@ -167,8 +167,8 @@ impl Sampler {
         }
     }
 
-    /// Samples whether the parts of all arms are reflected: not if the arms are near each other. Both keep their distance
-    /// in the mirror, but links that avoid each other have no mirror image.
+    /// Samples whether the parts of all arms are reflected: always possible if the task's whole scene has a mirror image,
+    /// otherwise only while the arms are apart. Recombined arms are apart.
     fn sample_reflection(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         if self.config.reflection_prob == 0.0 || !self.layout.has_reflection() {
             return;
@@ -176,7 +176,8 @@ impl Sampler {
         let are_independent = || match self.sample.steps[..] {
             [_] => true,
             [first, second] => {
-                self.layout.has_recombinable_arms() && is_apart(buffer, [first, second])
+                self.layout.has_reflected_scene()
+                    || (self.layout.has_recombinable_arms() && is_apart(buffer, [first, second]))
             }
             _ => false,
         };

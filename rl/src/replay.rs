@@ -200,15 +200,18 @@ fn overwrite<T: Copy>(table: &mut [T], row_idx: usize, row: &[T]) {
 
 #[cfg(test)]
 pub(crate) mod fixtures {
-    use tandem_core::Layout;
-
     use super::*;
 
     /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is
     /// zero.
-    pub(crate) fn drifting_episode(layout: Layout, number: u64, drift_m: f32) -> Episode {
-        let mut episode = Episode::zeros(layout, number);
-        let x = layout.achieved_goal_of(ArmIndex(0)).start;
+    pub(crate) fn drifting_episode(
+        layout: impl Into<TaskSpec>,
+        number: u64,
+        drift_m: f32,
+    ) -> Episode {
+        let layout = layout.into();
+        let mut episode = Episode::zeros(&layout, number);
+        let x = layout.achieved_goal_of(ArmIndex(0)).index(0);
         let mut position = 0.0;
         for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
             observation[x] = position;

@@ -105,6 +105,8 @@ impl Layout {
             action: vec![1],
             moved: fingers.flat_map(|at| [[at, at + 2], [at + 1, at + 2], [at + 2, at]]).collect(),
             plane: 0.0,
+            // Both bases lie in the plane, and a Mico's links have mirror images.
+            whole_scene: self.n_arms > 1,
         }
     }
 

@@ -7,7 +7,7 @@ use crate::layout::ArmIndex;
 
 /// A reflection that turns an arm's part of a valid transition into that of another one, such as that of a table about the
 /// vertical plane through the arm's base. With several arms it holds while the arm is far enough from the others to be
-/// recombined. The default is no reflection.
+/// recombined, or always if it is that of the whole scene. The default is no reflection.
 ///
 /// Places are indices within the vector of one arm: 0 is the arm's first number.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, Serialize)]
@@ -27,6 +27,9 @@ pub struct Reflection {
     pub moved: Vec<[usize; 2]>,
     /// Coordinate of the plane.
     pub plane: f32,
+    /// Whether the arms and their links mirror each other about one plane, so that all arms of a transition can be reflected
+    /// at once, however near they are.
+    pub whole_scene: bool,
 }
 
 impl Reflection {
@@ -86,6 +89,12 @@ impl TaskSpec {
     #[must_use]
     pub fn has_reflection(&self) -> bool {
         self.0.reflection.is_some()
+    }
+
+    /// Returns true if all arms of a transition can be reflected at once, however near they are.
+    #[must_use]
+    pub fn has_reflected_scene(&self) -> bool {
+        self.has_reflection() && self.description().reflection.whole_scene
     }
 
     /// Writes the reflection of `from`'s part of the observation `source` as that of `to`; a copy if the task has no

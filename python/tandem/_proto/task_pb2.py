@@ -24,27 +24,27 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14tandem/v1/task.proto\x12\ttandem.v1\"\xfc\x03\n\x0fTaskDescription\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x15\n\rn_observation\x18\x02 \x01(\r\x12\x0e\n\x06n_goal\x18\x03 \x01(\r\x12\x10\n\x08n_action\x18\x04 \x01(\r\x12 \n\x04\x61rms\x18\x05 \x03(\x0b\x32\x12.tandem.v1.TaskArm\x12\x15\n\rachieved_goal\x18\x06 \x03(\r\x12\x15\n\repisode_steps\x18\x07 \x01(\r\x12\x11\n\ttolerance\x18\x08 \x01(\x02\x12\x1d\n\x04norm\x18\t \x01(\x0e\x32\x0f.tandem.v1.Norm\x12\x1c\n\x14interchangeable_arms\x18\n \x01(\x08\x12\x18\n\x10reports_contacts\x18\x0b \x01(\x08\x12\x19\n\x11observation_bound\x18\x0c \x03(\x02\x12\x12\n\ngoal_bound\x18\r \x03(\x02\x12\x17\n\x0forigin_distance\x18\x0e \x01(\x02\x12\x19\n\x11recombination_gap\x18\x0f \x01(\x02\x12\x0c\n\x04\x62\x61se\x18\x10 \x01(\x02\x12\x31\n\x0cmanipulation\x18\x11 \x01(\x0b\x32\x1b.tandem.v1.TaskManipulation\x12)\n\nreflection\x18\x12 \x01(\x0b\x32\x15.tandem.v1.Reflection\x12\x19\n\x11\x63ontact_distances\x18\x13 \x03(\x02\"\x87\x01\n\nReflection\x12\x13\n\x0bobservation\x18\x01 \x03(\r\x12\x0c\n\x04goal\x18\x02 \x03(\r\x12\x0e\n\x06\x61\x63tion\x18\x03 \x03(\r\x12%\n\x05moved\x18\x04 \x03(\x0b\x32\x16.tandem.v1.MovedNumber\x12\x10\n\x08position\x18\x05 \x03(\r\x12\r\n\x05plane\x18\x06 \x01(\x02\"\'\n\x0bMovedNumber\x12\n\n\x02to\x18\x01 \x01(\r\x12\x0c\n\x04\x66rom\x18\x02 \x01(\r\"\x80\x01\n\x10TaskManipulation\x12\x15\n\rshared_object\x18\x01 \x01(\x08\x12\x14\n\x0cone_arm_task\x18\x02 \x01(\t\x12\x15\n\rsuccess_steps\x18\x03 \x01(\r\x12(\n\x04\x61rms\x18\x04 \x03(\x0b\x32\x1a.tandem.v1.ArmManipulation\"\x84\x01\n\x0f\x41rmManipulation\x12\x14\n\x07gripper\x18\x01 \x01(\rH\x00\x88\x01\x01\x12%\n\x07holding\x18\x02 \x03(\x0b\x32\x14.tandem.v1.Condition\x12(\n\nconditions\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ConditionB\n\n\x08_gripper\"?\n\tCondition\x12\x0f\n\x07numbers\x18\x01 \x03(\r\x12\x0e\n\x06target\x18\x02 \x03(\x02\x12\x11\n\ttolerance\x18\x03 \x01(\x02\"m\n\x07TaskArm\x12\x13\n\x0bobservation\x18\x01 \x03(\r\x12\x0c\n\x04goal\x18\x02 \x03(\r\x12\x0e\n\x06\x61\x63tion\x18\x03 \x03(\r\x12\x10\n\x08position\x18\x04 \x03(\r\x12\x0f\n\x07lateral\x18\x05 \x03(\r\x12\x0c\n\x04hand\x18\x06 \x03(\r*B\n\x04Norm\x12\x14\n\x10NORM_UNSPECIFIED\x10\x00\x12\x12\n\x0eNORM_EUCLIDEAN\x10\x01\x12\x10\n\x0cNORM_MAXIMUM\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14tandem/v1/task.proto\x12\ttandem.v1\"\xfc\x03\n\x0fTaskDescription\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x15\n\rn_observation\x18\x02 \x01(\r\x12\x0e\n\x06n_goal\x18\x03 \x01(\r\x12\x10\n\x08n_action\x18\x04 \x01(\r\x12 \n\x04\x61rms\x18\x05 \x03(\x0b\x32\x12.tandem.v1.TaskArm\x12\x15\n\rachieved_goal\x18\x06 \x03(\r\x12\x15\n\repisode_steps\x18\x07 \x01(\r\x12\x11\n\ttolerance\x18\x08 \x01(\x02\x12\x1d\n\x04norm\x18\t \x01(\x0e\x32\x0f.tandem.v1.Norm\x12\x1c\n\x14interchangeable_arms\x18\n \x01(\x08\x12\x18\n\x10reports_contacts\x18\x0b \x01(\x08\x12\x19\n\x11observation_bound\x18\x0c \x03(\x02\x12\x12\n\ngoal_bound\x18\r \x03(\x02\x12\x17\n\x0forigin_distance\x18\x0e \x01(\x02\x12\x19\n\x11recombination_gap\x18\x0f \x01(\x02\x12\x0c\n\x04\x62\x61se\x18\x10 \x01(\x02\x12\x31\n\x0cmanipulation\x18\x11 \x01(\x0b\x32\x1b.tandem.v1.TaskManipulation\x12)\n\nreflection\x18\x12 \x01(\x0b\x32\x15.tandem.v1.Reflection\x12\x19\n\x11\x63ontact_distances\x18\x13 \x03(\x02\"\x9c\x01\n\nReflection\x12\x13\n\x0bobservation\x18\x01 \x03(\r\x12\x0c\n\x04goal\x18\x02 \x03(\r\x12\x0e\n\x06\x61\x63tion\x18\x03 \x03(\r\x12%\n\x05moved\x18\x04 \x03(\x0b\x32\x16.tandem.v1.MovedNumber\x12\x10\n\x08position\x18\x05 \x03(\r\x12\r\n\x05plane\x18\x06 \x01(\x02\x12\x13\n\x0bwhole_scene\x18\x07 \x01(\x08\"\'\n\x0bMovedNumber\x12\n\n\x02to\x18\x01 \x01(\r\x12\x0c\n\x04\x66rom\x18\x02 \x01(\r\"\x80\x01\n\x10TaskManipulation\x12\x15\n\rshared_object\x18\x01 \x01(\x08\x12\x14\n\x0cone_arm_task\x18\x02 \x01(\t\x12\x15\n\rsuccess_steps\x18\x03 \x01(\r\x12(\n\x04\x61rms\x18\x04 \x03(\x0b\x32\x1a.tandem.v1.ArmManipulation\"\x84\x01\n\x0f\x41rmManipulation\x12\x14\n\x07gripper\x18\x01 \x01(\rH\x00\x88\x01\x01\x12%\n\x07holding\x18\x02 \x03(\x0b\x32\x14.tandem.v1.Condition\x12(\n\nconditions\x18\x03 \x03(\x0b\x32\x14.tandem.v1.ConditionB\n\n\x08_gripper\"?\n\tCondition\x12\x0f\n\x07numbers\x18\x01 \x03(\r\x12\x0e\n\x06target\x18\x02 \x03(\x02\x12\x11\n\ttolerance\x18\x03 \x01(\x02\"m\n\x07TaskArm\x12\x13\n\x0bobservation\x18\x01 \x03(\r\x12\x0c\n\x04goal\x18\x02 \x03(\r\x12\x0e\n\x06\x61\x63tion\x18\x03 \x03(\r\x12\x10\n\x08position\x18\x04 \x03(\r\x12\x0f\n\x07lateral\x18\x05 \x03(\r\x12\x0c\n\x04hand\x18\x06 \x03(\r*B\n\x04Norm\x12\x14\n\x10NORM_UNSPECIFIED\x10\x00\x12\x12\n\x0eNORM_EUCLIDEAN\x10\x01\x12\x10\n\x0cNORM_MAXIMUM\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'tandem.v1.task_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_NORM']._serialized_start=1167
-  _globals['_NORM']._serialized_end=1233
+  _globals['_NORM']._serialized_start=1188
+  _globals['_NORM']._serialized_end=1254
   _globals['_TASKDESCRIPTION']._serialized_start=36
   _globals['_TASKDESCRIPTION']._serialized_end=544
   _globals['_REFLECTION']._serialized_start=547
-  _globals['_REFLECTION']._serialized_end=682
-  _globals['_MOVEDNUMBER']._serialized_start=684
-  _globals['_MOVEDNUMBER']._serialized_end=723
-  _globals['_TASKMANIPULATION']._serialized_start=726
-  _globals['_TASKMANIPULATION']._serialized_end=854
-  _globals['_ARMMANIPULATION']._serialized_start=857
-  _globals['_ARMMANIPULATION']._serialized_end=989
-  _globals['_CONDITION']._serialized_start=991
-  _globals['_CONDITION']._serialized_end=1054
-  _globals['_TASKARM']._serialized_start=1056
-  _globals['_TASKARM']._serialized_end=1165
+  _globals['_REFLECTION']._serialized_end=703
+  _globals['_MOVEDNUMBER']._serialized_start=705
+  _globals['_MOVEDNUMBER']._serialized_end=744
+  _globals['_TASKMANIPULATION']._serialized_start=747
+  _globals['_TASKMANIPULATION']._serialized_end=875
+  _globals['_ARMMANIPULATION']._serialized_start=878
+  _globals['_ARMMANIPULATION']._serialized_end=1010
+  _globals['_CONDITION']._serialized_start=1012
+  _globals['_CONDITION']._serialized_end=1075
+  _globals['_TASKARM']._serialized_start=1077
+  _globals['_TASKARM']._serialized_end=1186
 # @@protoc_insertion_point(module_scope)

@@ -59,20 +59,22 @@ class TaskDescription(_message.Message):
     def __init__(self, name: _Optional[str] = ..., n_observation: _Optional[int] = ..., n_goal: _Optional[int] = ..., n_action: _Optional[int] = ..., arms: _Optional[_Iterable[_Union[TaskArm, _Mapping]]] = ..., achieved_goal: _Optional[_Iterable[int]] = ..., episode_steps: _Optional[int] = ..., tolerance: _Optional[float] = ..., norm: _Optional[_Union[Norm, str]] = ..., interchangeable_arms: bool = ..., reports_contacts: bool = ..., observation_bound: _Optional[_Iterable[float]] = ..., goal_bound: _Optional[_Iterable[float]] = ..., origin_distance: _Optional[float] = ..., recombination_gap: _Optional[float] = ..., base: _Optional[float] = ..., manipulation: _Optional[_Union[TaskManipulation, _Mapping]] = ..., reflection: _Optional[_Union[Reflection, _Mapping]] = ..., contact_distances: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Reflection(_message.Message):
-    __slots__ = ("observation", "goal", "action", "moved", "position", "plane")
+    __slots__ = ("observation", "goal", "action", "moved", "position", "plane", "whole_scene")
     OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     GOAL_FIELD_NUMBER: _ClassVar[int]
     ACTION_FIELD_NUMBER: _ClassVar[int]
     MOVED_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
     PLANE_FIELD_NUMBER: _ClassVar[int]
+    WHOLE_SCENE_FIELD_NUMBER: _ClassVar[int]
     observation: _containers.RepeatedScalarFieldContainer[int]
     goal: _containers.RepeatedScalarFieldContainer[int]
     action: _containers.RepeatedScalarFieldContainer[int]
     moved: _containers.RepeatedCompositeFieldContainer[MovedNumber]
     position: _containers.RepeatedScalarFieldContainer[int]
     plane: float
-    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., moved: _Optional[_Iterable[_Union[MovedNumber, _Mapping]]] = ..., position: _Optional[_Iterable[int]] = ..., plane: _Optional[float] = ...) -> None: ...
+    whole_scene: bool
+    def __init__(self, observation: _Optional[_Iterable[int]] = ..., goal: _Optional[_Iterable[int]] = ..., action: _Optional[_Iterable[int]] = ..., moved: _Optional[_Iterable[_Union[MovedNumber, _Mapping]]] = ..., position: _Optional[_Iterable[int]] = ..., plane: _Optional[float] = ..., whole_scene: bool = ...) -> None: ...
 
 class MovedNumber(_message.Message):
     __slots__ = ("to",)

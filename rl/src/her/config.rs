@@ -54,8 +54,8 @@ pub struct ReplayConfig {
     /// interchangeable.
     pub arm_swap_prob: f32,
     /// Probability that a transition is reflected, in [0, 1] (invariant transform experience replay, Lin et al. 2020). It
-    /// takes effect in tasks that describe a reflection only, as those of the shared world do, and while arms are far
-    /// enough apart to be recombined.
+    /// takes effect in tasks that describe a reflection only, as those of the shared world do, and unless their whole scene
+    /// has a mirror image, while arms are far enough apart to be recombined.
     #[serde(default)]
     pub reflection_prob: f32,
     /// The reward that the critic learns.

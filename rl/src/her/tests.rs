@@ -148,7 +148,17 @@ fn reflected_rows(
     reflection_prob: f32,
     change: impl Fn(&mut Episode),
 ) -> Vec<(bool, Batch)> {
-    let layout = Layout::new(Task::SharedPickAndPlace, n_arms);
+    let layout = TaskSpec::built_in(Task::SharedPickAndPlace, n_arms);
+    reflected_rows_of(&layout, reflection_prob, change)
+}
+
+/// As [`reflected_rows`], for another description of the task.
+fn reflected_rows_of(
+    layout: &TaskSpec,
+    reflection_prob: f32,
+    change: impl Fn(&mut Episode),
+) -> Vec<(bool, Batch)> {
+    let n_arms = layout.n_arms();
     let mut episode = drifting_episode(layout, 0, 0.01);
     for (idx, value) in episode.observations.iter_mut().enumerate() {
         *value += (idx % layout.n_observation()) as f32 * 1e-4;
@@ -202,15 +212,20 @@ fn reflected_rows_are_the_mirror_images_of_the_same_rows() {
 }
 
 #[test]
-fn arms_that_are_near_each_other_are_not_reflected() {
+fn arms_that_are_near_each_other_are_reflected_with_the_whole_scene_only() {
     let none = |rows: Vec<(bool, Batch)>| rows.iter().all(|(reflected, _)| !reflected);
+    let mut of_arms = TaskSpec::built_in(Task::SharedPickAndPlace, 2).description().clone();
+    "described-pick-and-place".clone_into(&mut of_arms.name);
+    of_arms.reflection.whole_scene = false;
+    let of_arms = TaskSpec::new(of_arms).unwrap();
     // Hands and objects 16 cm in front of their origins, which are 24 cm apart.
     let in_front = |episode: &mut Episode| {
         for (idx, value) in episode.observations.iter_mut().enumerate() {
             *value += if [0, 3].contains(&(idx % 28)) { 0.16 } else { 0.0 };
         }
     };
-    assert!(none(reflected_rows(2, 1.0, in_front)));
+    assert!(none(reflected_rows_of(&of_arms, 1.0, in_front)));
+    assert!(reflected_rows(2, 1.0, in_front).iter().all(|(reflected, _)| *reflected));
     assert!(none(reflected_rows(1, 0.0, |_| ())));
 }
 

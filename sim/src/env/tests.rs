@@ -246,9 +246,14 @@ fn swapping_the_arms_is_a_symmetry() {
 /// first contact. The solver takes the contacts of a cube's corners in an order, so later they differ by
 /// millimetres.
 #[test]
-fn one_arm_in_the_shared_world_has_a_mirror_image() {
-    for (task, most_m) in [(Task::SharedPush, 0.01), (Task::SharedPickAndPlace, 0.02)] {
-        let layout = Layout::new(task, 1);
+fn the_shared_world_has_a_mirror_image() {
+    for (task, n_arms, most_m) in [
+        (Task::SharedPush, 1, 0.01),
+        (Task::SharedPickAndPlace, 1, 0.02),
+        (Task::SharedPush, 2, 0.01),
+        (Task::SharedPickAndPlace, 2, 0.02),
+    ] {
+        let layout = Layout::new(task, n_arms);
         let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
         let differences_m: Vec<Vec<f32>> =
             (0..30).map(|episode| reflection_difference_m(&mut env, episode)).collect();
@@ -271,7 +276,7 @@ fn reflection_difference_m(env: &mut Env, episode: u64) -> Vec<f32> {
     let noise: Vec<Vec<f32>> = (0..N_STEPS).map(|_| noise()).collect();
     let mut reflected_noise = noise.clone();
     for (action, reflected) in noise.iter().zip(&mut reflected_noise) {
-        spec.reflect_action(ARM, ARM, action, reflected);
+        layout.arms().for_each(|arm| spec.reflect_action(arm, arm, action, reflected));
     }
     let mirror = |point: Vector| Vector::new(point.x, -point.y, point.z);
     let reflect = |start: &ArmStart| ArmStart {
@@ -284,7 +289,8 @@ fn reflection_difference_m(env: &mut Env, episode: u64) -> Vec<f32> {
     let original = observations(env, &starts, &noise);
     let mut reflected = observations(env, &reflected_starts, &reflected_noise);
     for observation in &mut reflected {
-        spec.reflect_observation(ARM, ARM, &observation.clone(), observation);
+        let original = observation.clone();
+        layout.arms().for_each(|arm| spec.reflect_observation(arm, arm, &original, observation));
     }
     difference_m(layout, &original, &reflected)
 }
