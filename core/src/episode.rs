@@ -15,7 +15,8 @@ pub enum EpisodeKind {
     Evaluation,
 }
 
-/// The set of contacts during one control step.
+/// The set of contacts during one control step. An environment may say which arms touched the table; it then does so for all
+/// of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Contacts(u8);
 
@@ -26,6 +27,8 @@ impl Contacts {
     pub const ARM_ARM: Self = Self(1);
     /// Part of an arm touched the table.
     pub const ARM_TABLE: Self = Self(2);
+    /// Part of the first arm, or of the second one, touched the table. Includes [`ARM_TABLE`](Self::ARM_TABLE).
+    pub const TABLE_OF: [Self; 2] = [Self(2 | 4), Self(2 | 8)];
 
     /// Returns `true` if this set includes all contacts of `other`.
     #[must_use]
@@ -39,16 +42,37 @@ impl Contacts {
         self.0 != 0
     }
 
-    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE).
+    /// Returns `true` if `arm` touched another arm or the table. An arm counts as touching the table unless the environment
+    /// said which arms did.
+    #[must_use]
+    pub fn involves(self, arm: ArmIndex) -> bool {
+        let knows_arms = Self::TABLE_OF.iter().any(|of_arm| self.contains(*of_arm));
+        let touches_table = match Self::TABLE_OF.get(arm.0) {
+            Some(of_arm) if knows_arms => self.contains(*of_arm),
+            _ => self.contains(Self::ARM_TABLE) && !knows_arms,
+        };
+        self.contains(Self::ARM_ARM) || touches_table
+    }
+
+    /// Returns these contacts without saying which arms touched the table.
+    #[must_use]
+    pub const fn of_any_arm(self) -> Self {
+        Self(self.0 & (Self::ARM_ARM.0 | Self::ARM_TABLE.0))
+    }
+
+    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE), bits 2 and 3
+    /// tell which of two arms touched the table.
     #[must_use]
     pub const fn bits(self) -> u8 {
         self.0
     }
 
-    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set.
+    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set, or an arm touched the table although none
+    /// did.
     #[must_use]
     pub const fn from_bits(bits: u8) -> Option<Self> {
-        if bits & !3 == 0 { Some(Self(bits)) } else { None }
+        let contradicts = bits & 0b1100 != 0 && bits & 0b10 == 0;
+        if bits & !0b1111 == 0 && !contradicts { Some(Self(bits)) } else { None }
     }
 }
 
@@ -202,5 +226,35 @@ impl Episode {
     #[must_use]
     pub fn moved(&self) -> bool {
         self.layout.is_displaced(self.observation(0), self.last_observation())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_contact_with_the_table_is_that_of_the_arms_it_names_or_of_all() {
+        let [first, second] = Contacts::TABLE_OF;
+        for (contacts, expected) in [
+            (Contacts::NONE, [false, false]),
+            (Contacts::ARM_TABLE, [true, true]),
+            (first, [true, false]),
+            (second, [false, true]),
+            (first | second, [true, true]),
+            (first | Contacts::ARM_ARM, [true, true]),
+            (first.of_any_arm(), [true, true]),
+        ] {
+            let involved = [0, 1].map(|arm| contacts.involves(ArmIndex(arm)));
+            assert_eq!(involved, expected, "{contacts:?}");
+            assert_eq!(Contacts::from_bits(contacts.bits()), Some(contacts));
+        }
+    }
+
+    #[test]
+    fn bits_that_contradict_each_other_are_no_contacts() {
+        for bits in [0b0100, 0b1001, 0b1_0000] {
+            assert_eq!(Contacts::from_bits(bits), None, "{bits:#b}");
+        }
     }
 }

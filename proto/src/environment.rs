@@ -447,7 +447,7 @@ mod tests {
         );
         check(
             |reply| reply.contacts[1] = 4,
-            "contacts[1]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
+            "contacts[1]: expected bits 0 (arm and arm), 1 (arm and table), and with it 2 and 3 (first, second arm), got 0b00000100",
         );
         check(|reply| reply.goals = vec![0; 24], "goals: expected no bytes, got 24 bytes");
         let name = "silent".to_owned();

@@ -129,8 +129,10 @@ impl Sampler {
                 &mut batch.bc_mask[row_of(n_action)],
             );
             batch.rewards[row_of(n_heads)].copy_from_slice(&self.sample.rewards);
-            if self.sample.touches || has_contact_within(buffer, self.sample.steps[0], 1) {
-                for reward in &mut batch.rewards[row_of(n_heads)] {
+            for (head, reward) in batch.rewards[row_of(n_heads)].iter_mut().enumerate() {
+                let arms = if n_heads == 1 { 0..self.layout.n_arms() } else { head..head + 1 };
+                let mut arms = arms.map(ArmIndex);
+                if self.sample.touches || arms.any(|arm| self.touches_within(buffer, arm, 1)) {
                     *reward -= self.contact_cost;
                 }
             }
@@ -343,7 +345,7 @@ impl Sampler {
 
     fn write_action(&self, buffer: &ReplayBuffer, actions: &mut [f32], bc_mask: &mut [f32]) {
         for (to, from) in self.layout.arms().zip(self.sources()) {
-            let step @ StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
+            let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let action = buffer.action(episode_idx, step_idx);
             if self.sample.reflected {
                 self.layout.reflect_action(to, from, action, actions);
@@ -353,10 +355,17 @@ impl Sampler {
             let is_advised = buffer.advised_arms(episode_idx, step_idx) >> from.0 & 1 == 1;
             let foresight = self.config.contact_foresight_steps;
             let leads_to_contact =
-                self.sample.touches || has_contact_within(buffer, step, foresight);
+                self.sample.touches || self.touches_within(buffer, from, foresight);
             let is_cloned = is_advised && !leads_to_contact;
             self.layout.action_of(to).fill(bc_mask, if is_cloned { 1.0 } else { 0.0 });
         }
+    }
+
+    /// Returns true if `arm` touches another arm or the table on one of `n_steps` steps from its sampled one on.
+    fn touches_within(&self, buffer: &ReplayBuffer, arm: ArmIndex, n_steps: usize) -> bool {
+        let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
+        let end = (step_idx + n_steps).min(self.layout.episode_steps());
+        buffer.has_contact_of(arm, step_idx..end, episode_idx)
     }
 
     /// Returns the arm whose data fills each place: the arms in order, or in reverse if they are swapped.
@@ -382,12 +391,6 @@ fn write_goal(
     }
 }
 
-/// Returns true if an arm touches the other or the table on one of `n_steps` steps from `first` on.
-fn has_contact_within(buffer: &ReplayBuffer, first: StepIndex, n_steps: usize) -> bool {
-    let end = (first.step_idx + n_steps).min(buffer.layout().episode_steps());
-    buffer.has_contact(first.step_idx..end, first.episode_idx)
-}
-
 /// Returns true if the hands of two arms touch after they take these steps at the same time.
 fn would_touch(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
     let after = steps
@@ -398,7 +401,10 @@ fn would_touch(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
 /// Returns true if two arms cannot meet when they take these steps at the same time: neither step has a contact, and
 /// the arms stay apart before and after.
 fn is_apart(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
-    if steps.iter().any(|step| has_contact_within(buffer, *step, 1)) {
+    let has_contact = |StepIndex { episode_idx, step_idx }: &StepIndex| {
+        buffer.has_contact(*step_idx..step_idx + 1, *episode_idx)
+    };
+    if steps.iter().any(has_contact) {
         return false;
     }
     [0, 1].into_iter().all(|later| {

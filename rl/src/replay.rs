@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
-use tandem_core::{ArmIndex, Episode, TaskSpec};
+use tandem_core::{ArmIndex, Contacts, Episode, TaskSpec};
 
 /// The replay buffer: whole episodes in flat arrays, episode `e` at `e * stride` of each. A full buffer overwrites the
 /// oldest episode.
@@ -174,6 +174,14 @@ impl ReplayBuffer {
     pub fn has_contact(&self, steps: Range<usize>, episode_idx: usize) -> bool {
         let start = episode_idx * self.layout.episode_steps();
         self.parts.contacts[start + steps.start..start + steps.end].iter().any(|bits| *bits != 0)
+    }
+
+    /// Returns true if `arm` touched another arm or the table on one of the steps of a stored episode.
+    #[must_use]
+    pub fn has_contact_of(&self, arm: ArmIndex, steps: Range<usize>, episode_idx: usize) -> bool {
+        let start = episode_idx * self.layout.episode_steps();
+        let involves = |bits: &u8| Contacts::from_bits(*bits).is_some_and(|all| all.involves(arm));
+        self.parts.contacts[start + steps.start..start + steps.end].iter().any(involves)
     }
 
     fn observation_stride(&self) -> usize {

@@ -41,6 +41,8 @@ pub(crate) struct WorldParameters {
     /// Force on an object from above, newtons, that counts as a contact with the table, if any does. Arms whose torques are
     /// supervised stop at such a force.
     pub(crate) press_limit_n: Option<f32>,
+    /// Whether contacts with the table say which arm touched it.
+    pub(crate) attributes_contacts: bool,
 }
 
 static CLASSIC: WorldParameters = WorldParameters {
@@ -55,6 +57,7 @@ static CLASSIC: WorldParameters = WorldParameters {
     gripper: &THREE_FINGERS,
     palm_force_n: 40.0,
     press_limit_n: None,
+    attributes_contacts: false,
 };
 
 /// The gain covers 91 % of a displacement of 5 cm within a control step, and 98 % of a short one. The workspace's floor
@@ -72,6 +75,7 @@ static SHARED: WorldParameters = WorldParameters {
     gripper: &MICO_HAND,
     palm_force_n: 40.0,
     press_limit_n: Some(10.0),
+    attributes_contacts: true,
 };
 
 /// A step covers the same share of a displacement as in the classic world, so a policy of that world can act here. Two
@@ -89,6 +93,7 @@ static SLOW: WorldParameters = WorldParameters {
     gripper: &THREE_FINGERS,
     palm_force_n: 10.0,
     press_limit_n: None,
+    attributes_contacts: false,
 };
 
 impl WorldParameters {

@@ -169,10 +169,10 @@ impl Physics {
         let both = group(pair.collider1) | group(pair.collider2);
         if both == HANDS[0] | HANDS[1] {
             Contacts::ARM_ARM
-        } else if both == TABLES[0] | HANDS[0] || both == TABLES[1] | HANDS[1] {
-            Contacts::ARM_TABLE
         } else {
-            Contacts::NONE
+            let touches_table = |arm: usize| both == TABLES[arm] | HANDS[arm];
+            let arm = (0..HANDS.len()).find(|arm| touches_table(*arm));
+            arm.map_or(Contacts::NONE, |arm| Contacts::TABLE_OF[arm])
         }
     }
 }

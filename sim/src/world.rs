@@ -261,10 +261,12 @@ impl World {
             self.drive(if substep < self.delay_substeps { &previous } else { commands });
             self.physics.step();
             contacts = contacts | self.physics.hand_contacts();
-            if let Some(limit_n) = self.parameters.press_limit_n
-                && self.physics.downward_forces_n().iter().any(|force_n| *force_n > limit_n)
-            {
-                contacts = contacts | Contacts::ARM_TABLE;
+            if let Some(limit_n) = self.parameters.press_limit_n {
+                for (arm, force_n) in self.physics.downward_forces_n().into_iter().enumerate() {
+                    if force_n > limit_n {
+                        contacts = contacts | Contacts::TABLE_OF[arm];
+                    }
+                }
             }
             if self.has_bar {
                 self.update_gripping();
@@ -275,7 +277,7 @@ impl World {
         if self.link_gap_m().min(hand_gap_m) < self.contact_margin_m {
             contacts = contacts | Contacts::ARM_ARM;
         }
-        Ok(contacts)
+        Ok(if self.parameters.attributes_contacts { contacts } else { contacts.of_any_arm() })
     }
 
     /// Sets the forces on the hands for the next physics step.

@@ -127,6 +127,7 @@ fn a_reflection_acts_on_the_part_of_one_arm_and_is_its_own_inverse() {
         action: vec![],
         moved: vec![[0, 1], [1, 0]],
         plane: 0.25,
+        whole_scene: false,
     };
     let task = TaskSpec::new(description).unwrap();
     let (first, second) = (ArmIndex(0), ArmIndex(1));

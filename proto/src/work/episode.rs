@@ -88,7 +88,8 @@ fn decode_contacts(contacts: &[u8], n_steps: usize) -> Result<Vec<Contacts>, Dec
 /// Decodes the byte at an index of `contacts`.
 pub(crate) fn decode_contact((idx, bits): (usize, &u8)) -> Result<Contacts, DecodeError> {
     let unknown = || {
-        let expected = "bits 0 (arm and arm) and 1 (arm and table)";
+        let expected =
+            "bits 0 (arm and arm), 1 (arm and table), and with it 2 and 3 (first, second arm)";
         let got = format_args!("{bits:#010b}").to_string();
         DecodeError::new(format!("contacts[{idx}]"), expected, got)
     };
@@ -167,7 +168,7 @@ mod tests {
         );
         check(
             |e| e.contacts[49] = 4,
-            "contacts[49]: expected bits 0 (arm and arm) and 1 (arm and table), got 0b00000100",
+            "contacts[49]: expected bits 0 (arm and arm), 1 (arm and table), and with it 2 and 3 (first, second arm), got 0b00000100",
         );
         check(
             |e| e.observations[400..404].copy_from_slice(&1e29_f32.to_le_bytes()),

@@ -67,16 +67,16 @@ pub struct ReplayConfig {
     /// Distance between an object and its goal, in the unit of the goal, within which training rewards it: in the
     /// built-in tasks 0.0001 to 1 m, else above 0 (paper: 0.05 m). The task's own tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
     pub goal_tolerance_m: f32,
-    /// Cost to every arm of a step on which an arm touches the other or the table, 0 to 100; a pending goal costs 1
-    /// (paper: 0).
+    /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper: 0). A
+    /// contact with the table costs every arm unless the environment says which arm it was, as the shared world does.
     pub contact_cost: f32,
     /// Factor by which this cost grows, 1 to 100: linearly from one quarter to three quarters of the run's environment
     /// steps, so that the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps
     /// keeps the cost.
     #[serde(default = "constant")]
     pub contact_cost_growth: f32,
-    /// Advice is not cloned on the last steps before a contact: this many, counting the step of the contact, 0 to the
-    /// episode's steps (paper: 0).
+    /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of the
+    /// contact, 0 to the episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
 }
 

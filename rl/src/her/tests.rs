@@ -267,6 +267,33 @@ fn a_contact_costs_both_arms_and_stops_cloning_before_it() {
 }
 
 #[test]
+fn a_contact_of_one_arm_with_the_table_costs_that_arm_only() {
+    let mut episode = episode();
+    episode.contacts[20] = Contacts::TABLE_OF[1];
+    let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
+    buffer.push(&episode);
+    for swapped in [false, true] {
+        let change = |config: &mut ReplayConfig| {
+            config.arm_swap_prob = if swapped { 1.0 } else { 0.0 };
+            config.her_ratio = 0.0;
+            (config.contact_cost, config.contact_foresight_steps) = (0.75, 1);
+        };
+        let batch = filled(change, &buffer);
+        let (mut expected, mut n_rows) = ([-1.0, -1.75], 0);
+        if swapped {
+            expected.reverse();
+        }
+        for (row, rewards) in batch.rewards.chunks_exact(2).enumerate() {
+            let first = if swapped { row * 6 + 3 } else { row * 6 };
+            let is_step = batch.actions[first] == 120.0;
+            assert_eq!(rewards, if is_step { expected } else { [-1.0; 2] });
+            n_rows += usize::from(is_step);
+        }
+        assert!(n_rows > 0, "too few draws");
+    }
+}
+
+#[test]
 fn an_intervention_costs_the_step_before_it_unless_the_goal_is_one_of_hindsight() {
     let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
     let mut advised = drifting_episode(LAYOUT, 0, 0.0);

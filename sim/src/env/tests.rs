@@ -132,7 +132,7 @@ fn contacts_of_a_move(task: Task, hand: Vector, action: Vector) -> Contacts {
 fn a_hand_that_presses_a_cube_onto_the_table_touches_the_table_in_the_shared_world() {
     let (above, beside) = (Vector::new(0.05, 0.0, 0.07), Vector::new(-0.01, 0.0, 0.031));
     let press = |task| contacts_of_a_move(task, above, Vector::NEG_Z);
-    assert_eq!(press(Task::SharedPush), Contacts::ARM_TABLE);
+    assert_eq!(press(Task::SharedPush), Contacts::TABLE_OF[0]);
     assert_eq!(press(Task::Push), Contacts::NONE);
     assert_eq!(contacts_of_a_move(Task::SharedPush, beside, Vector::X), Contacts::NONE);
 }
