@@ -42,16 +42,20 @@ impl Contacts {
         self.0 != 0
     }
 
-    /// Returns `true` if `arm` touched another arm or the table. An arm counts as touching the table unless the environment
-    /// said which arms did.
+    /// Returns `true` if `arm` touched another arm or the table.
     #[must_use]
     pub fn involves(self, arm: ArmIndex) -> bool {
+        self.contains(Self::ARM_ARM) || self.touches_table(arm)
+    }
+
+    /// Returns `true` if `arm` touched the table, as every arm does unless the environment said which arms did.
+    #[must_use]
+    pub fn touches_table(self, arm: ArmIndex) -> bool {
         let knows_arms = Self::TABLE_OF.iter().any(|of_arm| self.contains(*of_arm));
-        let touches_table = match Self::TABLE_OF.get(arm.0) {
+        match Self::TABLE_OF.get(arm.0) {
             Some(of_arm) if knows_arms => self.contains(*of_arm),
             _ => self.contains(Self::ARM_TABLE) && !knows_arms,
-        };
-        self.contains(Self::ARM_ARM) || touches_table
+        }
     }
 
     /// Returns these contacts without saying which arms touched the table.

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::reward::{REWARD_ACHIEVED, sparse_reward_within};
 use tandem_core::rng::{bernoulli, index};
 use tandem_core::task::Part;
-use tandem_core::{ArmIndex, TaskSpec};
+use tandem_core::{ArmIndex, Contacts, TaskSpec};
 use tandem_policy::NormalizerSnapshot;
 
 use crate::ddpg::Batch;
@@ -131,10 +131,8 @@ impl Sampler {
             batch.rewards[row_of(n_heads)].copy_from_slice(&self.sample.rewards);
             for (head, reward) in batch.rewards[row_of(n_heads)].iter_mut().enumerate() {
                 let arms = if n_heads == 1 { 0..self.layout.n_arms() } else { head..head + 1 };
-                let mut arms = arms.map(ArmIndex);
-                if self.sample.touches || arms.any(|arm| self.touches_within(buffer, arm, 1)) {
-                    *reward -= self.contact_cost;
-                }
+                let costs = arms.map(|arm| self.cost_of_contacts(buffer, ArmIndex(arm)));
+                *reward -= costs.fold(0.0, f32::max);
             }
             if self.sample.swapped && n_heads > 1 {
                 batch.rewards[row_of(n_heads)].reverse();
@@ -256,6 +254,16 @@ impl Sampler {
         let is_advised = |step_idx| buffer.advised_arms(episode_idx, step_idx) >> arm.0 & 1 == 1;
         let leads_to_intervention = !is_advised(step_idx) && is_advised(step_idx + 1);
         if leads_to_intervention { self.intervention_cost } else { 0.0 }
+    }
+
+    /// Returns the cost to `arm` of the contacts of its sampled step.
+    fn cost_of_contacts(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
+        let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
+        let contacts = buffer.contacts(episode_idx, step_idx);
+        let touches_arm = self.sample.touches || contacts.contains(Contacts::ARM_ARM);
+        let of_arms = if touches_arm { self.contact_cost } else { 0.0 };
+        let of_table = self.contact_cost * self.config.table_cost_factor;
+        of_arms.max(if contacts.touches_table(arm) { of_table } else { 0.0 })
     }
 
     /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.

@@ -176,12 +176,17 @@ impl ReplayBuffer {
         self.parts.contacts[start + steps.start..start + steps.end].iter().any(|bits| *bits != 0)
     }
 
+    /// Returns the contacts during a step of a stored episode.
+    #[must_use]
+    pub fn contacts(&self, episode_idx: usize, step_idx: usize) -> Contacts {
+        let bits = self.parts.contacts[episode_idx * self.layout.episode_steps() + step_idx];
+        Contacts::from_bits(bits).unwrap_or(Contacts::NONE)
+    }
+
     /// Returns true if `arm` touched another arm or the table on one of the steps of a stored episode.
     #[must_use]
     pub fn has_contact_of(&self, arm: ArmIndex, steps: Range<usize>, episode_idx: usize) -> bool {
-        let start = episode_idx * self.layout.episode_steps();
-        let involves = |bits: &u8| Contacts::from_bits(*bits).is_some_and(|all| all.involves(arm));
-        self.parts.contacts[start + steps.start..start + steps.end].iter().any(involves)
+        steps.into_iter().any(|step_idx| self.contacts(episode_idx, step_idx).involves(arm))
     }
 
     fn observation_stride(&self) -> usize {

@@ -173,6 +173,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
     let tandem = recipe == Recipe::Tandem;
     let avoids_contacts = tandem && layout.n_arms() > 1 && layout.reports_contacts();
     let tolerance = layout.tolerance();
+    let pair_shares_table = avoids_contacts && is_shared(layout);
     ReplayConfig {
         capacity_transitions: 1_000_000,
         her_ratio: 0.8,
@@ -184,12 +185,33 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         reflection_prob: if tandem && layout.has_reflection() { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
         joint_goal_statistics: !tandem,
-        // Four fifths of the tolerance; of 0.05 m exactly 0.04 m.
-        goal_tolerance_m: if tandem { tolerance * 4.0 / 5.0 } else { tolerance },
-        // One arm of the shared world learns not to press.
-        contact_cost: if avoids_contacts || (tandem && is_shared(layout)) { 1.0 } else { 0.0 },
-        contact_cost_growth: if avoids_contacts && is_shared(layout) { 3.0 } else { 1.0 },
-        contact_foresight_steps: if avoids_contacts { 5.min(layout.episode_steps()) } else { 0 },
+        // Four or three fifths of the tolerance; of 0.05 m exactly 0.04 or 0.03 m.
+        goal_tolerance_m: match (tandem, pair_shares_table) {
+            (true, true) => tolerance / 5.0 * 3.0,
+            (true, false) => tolerance * 4.0 / 5.0,
+            (false, _) => tolerance,
+        },
+        contact_cost: match (pair_shares_table, avoids_contacts) {
+            // It grows, so that the arms first learn to reach their goals.
+            (true, _) => 0.2,
+            (false, true) => 1.0,
+            // One arm of the shared world learns not to press.
+            (false, false) => {
+                if tandem && is_shared(layout) {
+                    1.0
+                } else {
+                    0.0
+                }
+            }
+        },
+        contact_cost_growth: if pair_shares_table { 6.0 } else { 1.0 },
+        table_cost_factor: 1.0,
+        contact_foresight_steps: match (pair_shares_table, avoids_contacts) {
+            // Near arms count as contacts, so more steps would leave little advice to clone.
+            (true, _) => 1,
+            (false, true) => 5.min(layout.episode_steps()),
+            (false, false) => 0,
+        },
     }
 }
 

@@ -75,12 +75,15 @@ pub struct ReplayConfig {
     /// keeps the cost.
     #[serde(default = "constant")]
     pub contact_cost_growth: f32,
+    /// Cost of a contact with the table, as a multiple of that cost, 0 to 100.
+    #[serde(default = "constant")]
+    pub table_cost_factor: f32,
     /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of the
     /// contact, 0 to the episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
 }
 
-/// The growth of a cost that stays the same.
+/// The factor of a cost that stays the same.
 const fn constant() -> f32 {
     1.0
 }
@@ -89,7 +92,7 @@ impl ReplayConfig {
     /// Returns the lowest reward of a step.
     #[must_use]
     pub const fn lowest_reward(&self) -> f32 {
-        -1.0 - self.contact_cost * self.contact_cost_growth
+        -1.0 - self.contact_cost * self.contact_cost_growth * self.table_cost_factor.max(1.0)
     }
 
     /// Checks every range for a task; NaN is in none.
@@ -120,6 +123,8 @@ impl ReplayConfig {
         OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
         let (key, growth) = ("replay.contact_cost_growth", self.contact_cost_growth);
         OutOfRange::unless((1.0..=100.0).contains(&growth), key, growth, "1 to 100")?;
+        let (key, factor) = ("replay.table_cost_factor", self.table_cost_factor);
+        OutOfRange::unless((0.0..=100.0).contains(&factor), key, factor, "0 to 100")?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
         let n_max = layout.episode_steps();
         OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;

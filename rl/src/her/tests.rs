@@ -25,6 +25,7 @@ fn config(reward: RewardKind) -> ReplayConfig {
         goal_tolerance_m: 0.05,
         contact_cost: 0.0,
         contact_cost_growth: 1.0,
+        table_cost_factor: 1.0,
         contact_foresight_steps: 0,
     }
 }
@@ -270,26 +271,32 @@ fn a_contact_costs_both_arms_and_stops_cloning_before_it() {
 fn a_contact_of_one_arm_with_the_table_costs_that_arm_only() {
     let mut episode = episode();
     episode.contacts[20] = Contacts::TABLE_OF[1];
+    episode.contacts[21] = Contacts::TABLE_OF[1] | Contacts::ARM_ARM;
     let mut buffer = ReplayBuffer::new(LAYOUT, 1000);
     buffer.push(&episode);
     for swapped in [false, true] {
         let change = |config: &mut ReplayConfig| {
             config.arm_swap_prob = if swapped { 1.0 } else { 0.0 };
             config.her_ratio = 0.0;
-            (config.contact_cost, config.contact_foresight_steps) = (0.75, 1);
+            (config.contact_cost, config.table_cost_factor) = (0.75, 2.0);
         };
         let batch = filled(change, &buffer);
-        let (mut expected, mut n_rows) = ([-1.0, -1.75], 0);
-        if swapped {
-            expected.reverse();
-        }
+        let mut seen = [false; 2];
         for (row, rewards) in batch.rewards.chunks_exact(2).enumerate() {
             let first = if swapped { row * 6 + 3 } else { row * 6 };
-            let is_step = batch.actions[first] == 120.0;
-            assert_eq!(rewards, if is_step { expected } else { [-1.0; 2] });
-            n_rows += usize::from(is_step);
+            let mut expected = match batch.actions[first] {
+                120.0 => [-1.0, -2.5],
+                126.0 => [-1.75, -2.5],
+                _ => [-1.0; 2],
+            };
+            seen[0] |= batch.actions[first] == 120.0;
+            seen[1] |= batch.actions[first] == 126.0;
+            if swapped {
+                expected.reverse();
+            }
+            assert_eq!(rewards, expected);
         }
-        assert!(n_rows > 0, "too few draws");
+        assert_eq!(seen, [true; 2], "too few draws");
     }
 }
 
