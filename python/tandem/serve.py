@@ -124,8 +124,9 @@ def _reflection(text: str) -> Reflection:
     try:
         given = json.loads(text)
         moved = tuple((to, place) for to, place in given.pop("moved", ()))
-        places = {name: tuple(given.pop(name, ())) for name in ("observation", "position", "goal", "action")}
-        return Reflection(**places, **given, moved=moved)
+        plane, whole_scene = float(given.pop("plane", 0.0)), bool(given.pop("whole_scene", False))
+        places = {name: tuple(places) for name, places in given.items()}
+        return Reflection(**places, moved=moved, plane=plane, whole_scene=whole_scene)
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected fetch or an object as tandem.Reflection: {error}") from None
 
