@@ -87,6 +87,17 @@ impl ForwardKinematics {
         jacobian
     }
 
+    /// Returns the force on the tool's origin that causes external torques `torques_nm`, base frame, newtons: the
+    /// least-squares solution. Returns `None` in a posture in which the torques do not determine it.
+    #[must_use]
+    pub fn tool_force(&self, torques_nm: &Joints) -> Option<Vector3<f64>> {
+        let jacobian = self.position_jacobian();
+        let terms =
+            torques_nm.iter().enumerate().map(|(joint, torque)| jacobian.column(joint) * *torque);
+        let inverse = (jacobian * jacobian.transpose()).try_inverse()?;
+        Some(inverse * terms.fold(Vector3::zeros(), |sum, term| sum + term))
+    }
+
     /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), metres per
     /// second.
     #[must_use]

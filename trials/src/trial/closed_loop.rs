@@ -1,10 +1,10 @@
 //! The closed loop: repeats observation, action and motion.
 
-use glam::{DVec3, EulerRot};
+use glam::{DMat3, DVec3, EulerRot};
 use tandem_core::ArmIndex;
 use tandem_core::scene::Cuboid;
 use tandem_kinematics::{
-    ArmWaypoint, CheckSettings, ForwardKinematics, Joints, ReachError, Waypoint, WorkCell,
+    ArmWaypoint, CheckSettings, ForwardKinematics, Joints, PlacedArm, ReachError, Waypoint,
 };
 
 use crate::simulated::{MAX_OPENING_M, ObjectPose, SharedObject};
@@ -16,6 +16,8 @@ use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{TrialRig, tool_positions};
 use crate::trial::runner::{REST_S, TrialExecution, TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
+
+mod yielding;
 
 /// A policy is done after this many consecutive observations in which every object was within this share of the
 /// tolerance of its goal.
@@ -87,6 +89,8 @@ struct LoopState {
     n_in_success: usize,
     /// Whether an arm holds an object that all arms share.
     carries: bool,
+    /// The displacements of the hands with which they withdraw from what they press on, own frames, metres.
+    withdraw: Option<Vec<DVec3>>,
     /// The waypoints of the tools so far.
     waypoints: Vec<Waypoint>,
 }
@@ -173,6 +177,9 @@ impl TrialRunner {
         let mut action = vec![0.0; layout.n_action()];
         policy.act(&observation, &goal, &mut action);
         let blocks = self.observed_blocks(&objects, start.shared.as_ref());
+        if self.withdraw(rig, state, &blocks)? {
+            return Ok(false);
+        }
         let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
@@ -267,15 +274,7 @@ impl TrialRunner {
         to: &[DVec3],
         check: &CheckSettings,
     ) -> Result<bool, FailureCause> {
-        let openings = state.openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m));
-        let first: Waypoint = tool_positions(self.mapping.cell(), &state.at)
-            .iter()
-            .zip(openings)
-            .map(|(tool, opening)| ArmWaypoint {
-                tool_in_world_m: (*tool).into(),
-                gripper_opening: opening,
-            })
-            .collect();
+        let first = self.tools(state);
         let Ok([corner, end, last]) = self.step_waypoints(to, state, wanted) else {
             return Ok(false);
         };
@@ -283,18 +282,40 @@ impl TrialRunner {
             state.openings_m.clone_from(&wanted.openings_m);
             return Ok(true);
         }
-        let waypoints = [first, corner, end, last];
+        let waypoints = [first.clone(), corner, end, last];
         let Ok(motion) = self.motion(&waypoints, &state.at, check) else { return Ok(false) };
         let ends: Vec<Joints> =
             motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-        match rig.play(motion, self.config.speed) {
+        let played = if state.carries {
+            rig.play(motion, self.config.speed).map(|()| true)
+        } else {
+            rig.play_yielding(motion, self.config.speed)
+        };
+        let is_whole = match played {
             Err(FailureCause::Refused(_)) => return Ok(false),
             played => played?,
-        }
-        state.append_waypoints(waypoints);
+        };
         state.at = ends;
         state.openings_m.clone_from(&wanted.openings_m);
+        if is_whole {
+            state.append_waypoints(waypoints);
+        } else {
+            self.yielded(rig, state, first);
+        }
         Ok(true)
+    }
+
+    /// Returns the tools at the commanded angles, with the commanded openings.
+    fn tools(&self, state: &LoopState) -> Waypoint {
+        let openings = state.openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m));
+        tool_positions(self.mapping.cell(), &state.at)
+            .iter()
+            .zip(openings)
+            .map(|(tool, opening)| ArmWaypoint {
+                tool_in_world_m: (*tool).into(),
+                gripper_opening: opening,
+            })
+            .collect()
     }
 
     /// The end effectors at the commanded angles, own frames, metres.
@@ -363,17 +384,17 @@ impl TrialRunner {
                 tool.map_err(|source| unreachable(idx, source))
             };
             let (_, then) = tool(to)?;
-            let tilt_rad = |angles| ForwardKinematics::new(placed.model, angles).tilt_rad();
-            let pads = Pads {
-                yaw_rad: placed.yaw_rad + WorkCell::FINGERS_YAW_RAD,
+            let pads = |centre, angles| Pads {
+                centre,
+                axes: tool_axes(placed, angles),
                 opening_m: before * f64::from(MAX_OPENING_M),
-                tilt_rad: tilt_rad(near).max(tilt_rad(&then)),
             };
+            let pads_before = pads(from, near);
             let [corner, end] = if state.carries {
-                let end = lowered(from, to, &pads, blocks);
+                let end = lowered(&pads_before, to, blocks);
                 [from.midpoint(end), end]
             } else {
-                avoid_blocks(from, to, &pads, blocks)
+                avoid_blocks(&pads_before, &pads(to, &then), blocks)
             };
             let openings = if opening < before {
                 [before, before, opening]
@@ -404,6 +425,7 @@ impl LoopState {
             n_done: 0,
             n_in_success: 0,
             carries: false,
+            withdraw: None,
             waypoints: Vec::new(),
         }
     }
@@ -441,6 +463,12 @@ fn is_joint(parts: &[StepPart]) -> bool {
     };
     let first = parts.first().and_then(share);
     first.is_some() && parts.iter().all(|part| share(part) == first)
+}
+
+/// Returns the axes of an arm's tool as columns, world frame: its fingers close along the first and point along the third.
+fn tool_axes(placed: &PlacedArm, angles: &Joints) -> DMat3 {
+    let tool = placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool();
+    DMat3::from_quat(tool.rotation.into())
 }
 
 fn is_still(from: &Waypoint, to: &Waypoint) -> bool {

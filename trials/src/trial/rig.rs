@@ -3,17 +3,24 @@
 use glam::DVec3;
 use tandem_core::scene::Scene;
 use tandem_core::{ArmIndex, Contacts};
-use tandem_kinematics::{ForwardKinematics, Joints, Motion, WorkCell};
+use tandem_kinematics::{ForwardKinematics, Joints, Motion, PlacedArm, WorkCell};
 
 use crate::simulated::{ObjectPose, PERIOD_S, SimulatedPair};
 use crate::trial::outcome::{FailureCause, MotionRefusal};
 use crate::trial::{Frame, PathPoint, TrialError, TrialObserver};
-use tandem_bridge::executor::{Executor, Phase, Settings, Token};
+use tandem_bridge::driver::ArmReading;
+use tandem_bridge::executor::{Executor, Phase, ResetError, Settings, Stop, Token};
 
 /// The only owner.
 const OWNER: Token = Token(1);
 /// Periods until there are enough good states for a reset.
 const N_WARM_UP: usize = 15;
+/// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres. The
+/// envelope stops the arms at 4.
+const YIELD_NM: f64 = 2.0;
+const YIELD_INCREASE_NM: f64 = 0.5;
+/// The longest time from a stop to a reset, periods.
+const N_RESET: usize = 100;
 /// Periods between two frames.
 const FRAME_PERIODS: u64 = 4;
 
@@ -85,6 +92,66 @@ impl<'a> TrialRig<'a> {
             self.check()?;
         }
         Ok(())
+    }
+
+    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then hold
+    /// their positions, with their grippers as open as they are. Returns whether the motion came to its end.
+    pub(crate) fn play_yielding(
+        &mut self,
+        motion: Motion,
+        speed: f64,
+    ) -> Result<bool, FailureCause> {
+        let torques = |rig: &Self| -> Vec<f64> {
+            let arms = rig.executor.state().map(|state| state.arms.as_slice()).unwrap_or_default();
+            let joints = arms
+                .iter()
+                .flat_map(|arm| arm.torques_nm.iter().flat_map(|torques| torques.iter()));
+            joints.map(|torque| torque.abs()).collect()
+        };
+        let now_s = self.now_s();
+        let before = torques(self);
+        let started = self.executor.start(OWNER, motion, speed, now_s);
+        started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))?;
+        while self.tick() != Phase::Idle {
+            self.check()?;
+            let presses = torques(self)
+                .iter()
+                .zip(&before)
+                .any(|(torque, before)| *torque > YIELD_NM.max(before + YIELD_INCREASE_NM));
+            if presses {
+                self.executor.stop(self.now_s());
+                return self.reset().map(|()| false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Makes the stopped arms idle once they are at rest.
+    fn reset(&mut self) -> Result<(), FailureCause> {
+        let mut reported = None;
+        for _ in 0..N_RESET {
+            self.tick();
+            match self.executor.reset(OWNER, self.now_s()) {
+                Ok(()) => return Ok(()),
+                Err(ResetError::Reported { arm, cause }) => reported = Some((arm, cause)),
+                Err(_) => {}
+            }
+        }
+        let Some((arm, cause)) = reported else { return self.check() };
+        let when_s = self.now_s();
+        Err(FailureCause::Stopped(Stop { when_s, arm: Some(arm), joint: None, cause }))
+    }
+
+    /// Returns the forces on the tools by the measured torques, world frame, newtons.
+    pub(crate) fn forces_n(&self) -> Vec<DVec3> {
+        let arms = self.executor.state().map(|state| state.arms.as_slice()).unwrap_or_default();
+        let of_arm = |(placed, arm): (&PlacedArm, &ArmReading)| {
+            let posture = ForwardKinematics::new(placed.model, &arm.angles);
+            arm.torques_nm
+                .and_then(|torques| posture.tool_force(&torques))
+                .map_or(DVec3::ZERO, |force_n| (placed.world_from_base() * force_n).into())
+        };
+        self.cell.arms.iter().zip(arms).map(of_arm).collect()
     }
 
     /// Waits for `time_s` without a motion.

@@ -1,0 +1,52 @@
+//! Arms that press on something: they stop before the envelope stops them, and withdraw.
+//!
+//! In the training world the servo of a hand has a limited force, so a hand that meets an obstacle stands still. The
+//! joints of an arm would press on.
+
+use glam::{DQuat, DVec3};
+use tandem_kinematics::Waypoint;
+
+use super::{LoopState, WantedStep};
+use crate::trial::block_avoidance::ObservedBlock;
+use crate::trial::outcome::FailureCause;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::TrialRunner;
+
+/// The force from which a hand withdraws, newtons, and the distance by which it does, metres.
+const PRESSING_N: f64 = 3.0;
+const WITHDRAW_M: f64 = 0.006;
+
+impl TrialRunner {
+    /// Continues from where the arms stopped on their way from `first`.
+    pub(super) fn yielded(&self, rig: &TrialRig<'_>, state: &mut LoopState, first: Waypoint) {
+        for (arm, (angles, opening)) in rig.encoders().into_iter().enumerate() {
+            state.at[arm] = angles;
+            state.openings_m[arm] = self.mapping.opening_in_own(opening);
+        }
+        let withdraw = rig.forces_n().into_iter().enumerate().map(|(arm, force_n)| {
+            if force_n.length() < PRESSING_N {
+                return DVec3::ZERO;
+            }
+            let yaw_rad = self.mapping.cell().arms[arm].yaw_rad;
+            DQuat::from_rotation_z(-yaw_rad) * (force_n.normalize() * WITHDRAW_M)
+        });
+        state.withdraw = Some(withdraw.collect());
+        let reached = self.tools(state);
+        state.append_waypoints([first, reached.clone(), reached.clone(), reached]);
+    }
+
+    /// Withdraws the hands that pressed on something in the step before. Returns whether there were any.
+    pub(super) fn withdraw(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+        blocks: &[ObservedBlock],
+    ) -> Result<bool, FailureCause> {
+        let Some(withdraw) = state.withdraw.take() else { return Ok(false) };
+        let hands = self.hands(state).iter().zip(withdraw).map(|(hand, by)| hand + by).collect();
+        let wanted = WantedStep { hands, openings_m: state.openings_m.clone(), blocks };
+        self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
+        state.withdraw = None;
+        Ok(true)
+    }
+}
