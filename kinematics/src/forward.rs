@@ -137,4 +137,15 @@ mod tests {
             assert!((moved / step - jacobian.column(joint)).norm() < 1e-5, "joint {joint}");
         }
     }
+
+    #[test]
+    fn torques_of_a_force_on_the_tool_determine_it() {
+        let angles = Joints::new(&[0.3, 2.5, 4.0, -1.0]);
+        let forward = ForwardKinematics::new(&MICO_4, &angles);
+        let force_n = Vector3::new(1.0, -2.0, 5.0);
+        let jacobian = forward.position_jacobian();
+        let torques_nm = Joints::from_fn(4, |joint| jacobian.column(joint).dot(&force_n));
+        let got_n = forward.tool_force(&torques_nm).expect("determined");
+        assert!((got_n - force_n).norm() < 1e-9, "{got_n}");
+    }
 }

@@ -353,18 +353,18 @@ impl RunConfig {
         (0..n_early).any(|point| early(point) == u128::from(round))
     }
 
-    /// Returns the cost of a contact in round `round`, from 0.
+    /// Returns the cost of a contact in round `round`, from 0. It grows between a tenth and half of the run.
     #[must_use]
     pub fn contact_cost(&self, round: u64) -> f32 {
         let growth = self.replay.contact_cost_growth - 1.0;
-        self.replay.contact_cost * (1.0 + self.share_of_middle_half(round) * growth)
+        self.replay.contact_cost * (1.0 + self.share_of_part(round, 0.1, 0.5) * growth)
     }
 
     /// Returns the weight of behaviour cloning in round `round`, from 0.
     #[must_use]
     pub fn bc_weight(&self, round: u64) -> f32 {
         let loss = 1.0 - self.ddpg.bc_final_fraction;
-        self.ddpg.bc_weight * (1.0 - self.share_of_middle_half(round) * loss)
+        self.ddpg.bc_weight * (1.0 - self.share_of_part(round, 0.25, 0.75) * loss)
     }
 
     /// Returns true if advice is filtered before it is cloned in round `round`, from 0.
@@ -375,16 +375,16 @@ impl RunConfig {
         is_limited && (round * self.env_steps_per_round()) as f64 >= start
     }
 
-    /// Returns the share of the middle half of the run's environment steps that lies before round `round`, in [0, 1]. It
-    /// is 0 in a run without a limit in environment steps.
+    /// Returns how much of the part of the run from `start` to `end`, fractions of its environment steps, lies before
+    /// round `round`, in [0, 1]. It is 0 in a run without a limit in environment steps.
     #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]
-    fn share_of_middle_half(&self, round: u64) -> f32 {
+    fn share_of_part(&self, round: u64, start: f64, end: f64) -> f32 {
         let max = self.stop.max_env_steps;
         if max == 0 {
             return 0.0;
         }
         let share = (round * self.env_steps_per_round()) as f64 / max as f64;
-        ((share - 0.25) / 0.5).clamp(0.0, 1.0) as f32
+        ((share - start) / (end - start)).clamp(0.0, 1.0) as f32
     }
 
     /// Returns the number of rounds between two evaluations, at least one.

@@ -261,9 +261,7 @@ impl Sampler {
         let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
         let contacts = buffer.contacts(episode_idx, step_idx);
         let touches_arm = self.sample.touches || contacts.contains(Contacts::ARM_ARM);
-        let of_arms = if touches_arm { self.contact_cost } else { 0.0 };
-        let of_table = self.contact_cost * self.config.table_cost_factor;
-        of_arms.max(if contacts.touches_table(arm) { of_table } else { 0.0 })
+        if touches_arm || contacts.touches_table(arm) { self.contact_cost } else { 0.0 }
     }
 
     /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.

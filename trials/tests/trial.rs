@@ -59,6 +59,16 @@ fn a_closed_loop_pushes_both_blocks_to_their_goals() {
 }
 
 #[test]
+fn a_hand_that_would_press_on_its_block_continues() {
+    let mut actor = shipped("student-push.safetensors");
+    let report = run(&mut trials(Task::Push, TrialMode::ClosedLoop, 1), 0, &mut actor);
+    assert_eq!(
+        report.cause, None,
+        "arm 0 exceeds 4 N m unless it yields or keeps its lower pad above the block"
+    );
+}
+
+#[test]
 fn a_trial_does_not_depend_on_the_trials_before_it() {
     let mut actor = shipped("student-push.safetensors");
     let alone = run(&mut trials(Task::Push, TrialMode::ClosedLoop, 2), 2, &mut actor);

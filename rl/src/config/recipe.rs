@@ -59,7 +59,11 @@ impl RunConfig {
                 budget_scope: if tandem { BudgetScope::Run } else { BudgetScope::Slot },
                 unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
-                share: if tandem { 0.5 } else { 1.0 },
+                share: match (tandem, is_shared(layout)) {
+                    (true, true) => 0.3,
+                    (true, false) => 0.5,
+                    (false, _) => 1.0,
+                },
             },
             rounds: rounds(recipe, layout),
             exploration: Exploration {
@@ -107,10 +111,10 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
             slots: 8,
             rollouts: 2,
             lag: 1,
-            updates_per_env_step: if is_shared(layout) && layout.n_arms() == 1 {
-                0.25
-            } else {
-                0.5
+            updates_per_env_step: match (is_shared(layout), layout.n_arms()) {
+                (true, 1) => 0.25,
+                (true, _) => 1.0,
+                (false, _) => 0.5,
             },
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
@@ -143,7 +147,7 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
             match (built_in.n_arms, built_in.task.grasps()) {
                 (1, false) => 100_000,
                 (1, true) => 200_000,
-                _ => 400_000,
+                _ => 600_000,
             }
         }
         (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
@@ -205,7 +209,6 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
             }
         },
         contact_cost_growth: if pair_shares_table { 6.0 } else { 1.0 },
-        table_cost_factor: 1.0,
         contact_foresight_steps: match (pair_shares_table, avoids_contacts) {
             // Near arms count as contacts, so more steps would leave little advice to clone.
             (true, _) => 1,

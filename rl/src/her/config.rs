@@ -70,14 +70,11 @@ pub struct ReplayConfig {
     /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper: 0). A
     /// contact with the table costs every arm unless the environment says which arm it was, as the shared world does.
     pub contact_cost: f32,
-    /// Factor by which this cost grows, 1 to 100: linearly from one quarter to three quarters of the run's environment
-    /// steps, so that the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps
+    /// Factor by which this cost grows, 1 to 100: linearly from a tenth to half of the run's environment steps, so
+    /// that the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps
     /// keeps the cost.
     #[serde(default = "constant")]
     pub contact_cost_growth: f32,
-    /// Cost of a contact with the table, as a multiple of that cost, 0 to 100.
-    #[serde(default = "constant")]
-    pub table_cost_factor: f32,
     /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of the
     /// contact, 0 to the episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
@@ -92,7 +89,7 @@ impl ReplayConfig {
     /// Returns the lowest reward of a step.
     #[must_use]
     pub const fn lowest_reward(&self) -> f32 {
-        -1.0 - self.contact_cost * self.contact_cost_growth * self.table_cost_factor.max(1.0)
+        -1.0 - self.contact_cost * self.contact_cost_growth
     }
 
     /// Checks every range for a task; NaN is in none.
@@ -123,8 +120,6 @@ impl ReplayConfig {
         OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
         let (key, growth) = ("replay.contact_cost_growth", self.contact_cost_growth);
         OutOfRange::unless((1.0..=100.0).contains(&growth), key, growth, "1 to 100")?;
-        let (key, factor) = ("replay.table_cost_factor", self.table_cost_factor);
-        OutOfRange::unless((0.0..=100.0).contains(&factor), key, factor, "0 to 100")?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
         let n_max = layout.episode_steps();
         OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;

@@ -27,7 +27,6 @@ fn config(reward: RewardKind) -> ReplayConfig {
         goal_tolerance_m: 0.05,
         contact_cost: 0.0,
         contact_cost_growth: 1.0,
-        table_cost_factor: 1.0,
         contact_foresight_steps: 0,
     }
 }

@@ -37,15 +37,15 @@ fn a_contact_of_one_arm_with_the_table_costs_that_arm_only() {
         let change = |config: &mut ReplayConfig| {
             config.arm_swap_prob = if swapped { 1.0 } else { 0.0 };
             config.her_ratio = 0.0;
-            (config.contact_cost, config.table_cost_factor) = (0.75, 2.0);
+            config.contact_cost = 0.75;
         };
         let batch = filled(change, &buffer);
         let mut seen = [false; 2];
         for (row, rewards) in batch.rewards.chunks_exact(2).enumerate() {
             let first = if swapped { row * 6 + 3 } else { row * 6 };
             let mut expected = match batch.actions[first] {
-                120.0 => [-1.0, -2.5],
-                126.0 => [-1.75, -2.5],
+                120.0 => [-1.0, -1.75],
+                126.0 => [-1.75, -1.75],
                 _ => [-1.0; 2],
             };
             seen[0] |= batch.actions[first] == 120.0;
