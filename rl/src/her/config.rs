@@ -70,9 +70,8 @@ pub struct ReplayConfig {
     /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper: 0). A
     /// contact with the table costs every arm unless the environment says which arm it was, as the shared world does.
     pub contact_cost: f32,
-    /// Factor by which this cost grows, 1 to 100: linearly from a tenth to half of the run's environment steps, so
-    /// that the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps
-    /// keeps the cost.
+    /// Factor by which this cost grows, 1 to 100: linearly from a tenth to half of the run's environment steps, so that the
+    /// policy first learns to achieve goals (paper: 1). A run without a limit in environment steps keeps the cost.
     #[serde(default = "constant")]
     pub contact_cost_growth: f32,
     /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of the

@@ -89,7 +89,7 @@ struct LoopState {
     n_in_success: usize,
     /// Whether an arm holds an object that all arms share.
     carries: bool,
-    /// The displacements of the hands with which they withdraw from what they press on, own frames, metres.
+    /// By how much each hand is to withdraw from what it presses on, own frames, metres.
     withdraw: Option<Vec<DVec3>>,
     /// The waypoints of the tools so far.
     waypoints: Vec<Waypoint>,
@@ -174,12 +174,12 @@ impl TrialRunner {
         state.count_done(&now, &start.goals, self.tolerance_m(), meets);
         state.carries = self.task.shares_object()
             && layout.arms().any(|arm| self.task.arm_holds(arm, &observation));
-        let mut action = vec![0.0; layout.n_action()];
-        policy.act(&observation, &goal, &mut action);
         let blocks = self.observed_blocks(&objects, start.shared.as_ref());
         if self.withdraw(rig, state, &blocks)? {
             return Ok(false);
         }
+        let mut action = vec![0.0; layout.n_action()];
+        policy.act(&observation, &goal, &mut action);
         let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];

@@ -85,13 +85,17 @@ impl<'a> TrialRig<'a> {
 
     /// Plays `motion` to its end.
     pub(crate) fn play(&mut self, motion: Motion, speed: f64) -> Result<(), FailureCause> {
-        let now_s = self.now_s();
-        let started = self.executor.start(OWNER, motion, speed, now_s);
-        started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))?;
+        self.start(motion, speed)?;
         while self.tick() != Phase::Idle {
             self.check()?;
         }
         Ok(())
+    }
+
+    fn start(&mut self, motion: Motion, speed: f64) -> Result<(), FailureCause> {
+        let now_s = self.now_s();
+        let started = self.executor.start(OWNER, motion, speed, now_s);
+        started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))
     }
 
     /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then hold
@@ -108,10 +112,8 @@ impl<'a> TrialRig<'a> {
                 .flat_map(|arm| arm.torques_nm.iter().flat_map(|torques| torques.iter()));
             joints.map(|torque| torque.abs()).collect()
         };
-        let now_s = self.now_s();
         let before = torques(self);
-        let started = self.executor.start(OWNER, motion, speed, now_s);
-        started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))?;
+        self.start(motion, speed)?;
         while self.tick() != Phase::Idle {
             self.check()?;
             let presses = torques(self)

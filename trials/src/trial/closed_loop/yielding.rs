@@ -46,6 +46,7 @@ impl TrialRunner {
         let hands = self.hands(state).iter().zip(withdraw).map(|(hand, by)| hand + by).collect();
         let wanted = WantedStep { hands, openings_m: state.openings_m.clone(), blocks };
         self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
+        // A withdrawal that meets something itself is not followed by another.
         state.withdraw = None;
         Ok(true)
     }
