@@ -61,6 +61,12 @@ impl Reach {
         (x_m * x_m + y * y).sqrt()
     }
 
+    /// Returns the point of the base's axis at `height_m` metres, arm frame.
+    #[must_use]
+    pub fn axis(&self, height_m: f32) -> Vector {
+        Vector::new(self.axis_x_m, 0.0, height_m)
+    }
+
     /// Moves a point (arm frame, metres) along its radius to the nearest one in reach.
     #[must_use]
     pub fn clamp(&self, point: Vector) -> Vector {

@@ -64,6 +64,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 mode: mode_of(*mode),
                 block,
                 trained_half_m: trained_half_m(policy, &block),
+                n_rehearsals: args.rehearsals,
                 seed: args.seed,
                 speed: args.speed,
                 simulated: SimulatedConfig { gripper, ..SimulatedConfig::default() },

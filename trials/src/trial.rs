@@ -1,11 +1,12 @@
 //! Trials: tests of a trained policy on arms that differ from the training world.
 //!
 //! A trial draws a start and goals as the training world does and places blocks of their true size on the simulated
-//! pair's table ([`rehearsal`]). [`TrialMode::OpenLoop`] is the paper's method (section 4.3): the policy's whole
-//! episode in the training world becomes one motion, which is planned, checked and executed without observing the
-//! objects. [`TrialMode::ClosedLoop`] queries the policy before every step with the measurements of cameras and
-//! encoders; each step is planned and checked as a separate motion, from rest to rest. [`TrialMode::Twin`] is an open
-//! loop whose motion was computed by a closed loop on a copy of the pair. All modes use the same executor and envelope.
+//! pair's table ([`rehearsal`]). [`TrialMode::OpenLoop`] follows the paper (section 4.3): the policy's whole episode in
+//! the training world becomes one motion, which is planned, checked and executed without observing the objects. Unlike
+//! the paper, it rehearses several episodes and executes the most robust one. [`TrialMode::ClosedLoop`] queries the
+//! policy before every step with the measurements of cameras and encoders; each step is planned and checked as a
+//! separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was computed by a closed loop on
+//! a copy of the pair. All modes use the same executor and envelope.
 //! [`outcome`] then evaluates the final positions of the objects.
 //!
 //! [`mapping`] relates the policy's world to the table.
@@ -35,6 +36,7 @@ mod closed_loop;
 mod coordination;
 mod open_loop;
 mod rig;
+mod robustness;
 mod runner;
 mod shared_object;
 mod training_hand;
@@ -88,6 +90,9 @@ pub struct TrialConfig {
     /// Half the edge of the blocks that the policy was trained with, metres: [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M),
     /// or that of `block` if their sizes varied. The policy perceives blocks and openings as those of such a block.
     pub trained_half_m: f64,
+    /// The largest number of rehearsals in the training world, at least 1, of which an open loop executes the most robust
+    /// one. Arms that share an object rehearse once.
+    pub n_rehearsals: u32,
     /// The seed of starts, goals, latencies and noise.
     pub seed: u64,
     /// The share of the highest speed, in (0, 1].

@@ -3,6 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
+use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Contacts, Layout, Task};
 use tandem_policy::{Actor, Policy};
 use tandem_trials::SimulatedConfig;
@@ -28,6 +29,7 @@ fn config(task: Task, mode: TrialMode, seed: u64) -> TrialConfig {
         mode,
         block: Block::small([0.0; 2]),
         trained_half_m: TRAINED_HALF_M,
+        n_rehearsals: 32,
         seed,
         speed: 1.0,
         simulated: SimulatedConfig::default(),
@@ -44,7 +46,7 @@ fn run(trials: &mut TrialRunner, number: u64, actor: &mut Actor) -> TrialReport 
 
 #[test]
 fn a_closed_loop_pushes_both_blocks_to_their_goals() {
-    let mut actor = shipped("student-push.safetensors");
+    let mut actor = shipped("student-push-classic.safetensors");
     let mut trials = trials(Task::Push, TrialMode::ClosedLoop, 2);
     for number in 0..6 {
         let report = run(&mut trials, number, &mut actor);
@@ -60,7 +62,7 @@ fn a_closed_loop_pushes_both_blocks_to_their_goals() {
 
 #[test]
 fn a_hand_that_would_press_on_its_block_continues() {
-    let mut actor = shipped("student-push.safetensors");
+    let mut actor = shipped("student-push-classic.safetensors");
     let report = run(&mut trials(Task::Push, TrialMode::ClosedLoop, 1), 0, &mut actor);
     assert_eq!(
         report.cause, None,
@@ -70,7 +72,7 @@ fn a_hand_that_would_press_on_its_block_continues() {
 
 #[test]
 fn a_trial_does_not_depend_on_the_trials_before_it() {
-    let mut actor = shipped("student-push.safetensors");
+    let mut actor = shipped("student-push-classic.safetensors");
     let alone = run(&mut trials(Task::Push, TrialMode::ClosedLoop, 2), 2, &mut actor);
     let mut after_others = trials(Task::Push, TrialMode::ClosedLoop, 2);
     run(&mut after_others, 0, &mut actor);
@@ -100,7 +102,7 @@ impl TrialObserver for Carrying {
 
 #[test]
 fn two_arms_carry_one_object_together() {
-    let mut actor = shipped("teacher-pick-and-place.safetensors");
+    let mut actor = shipped("teacher-pick-and-place-classic.safetensors");
     let mut trials = trials(Task::CarryBar, TrialMode::ClosedLoop, 1);
     for number in 0..3 {
         let mut carrying = Carrying::default();
@@ -156,6 +158,24 @@ fn an_idle_policy_does_not_reach_its_goals_and_is_observed() {
             assert!((object.end - object.start).length() < 1e-3, "no contact moved it");
         }
     }
+}
+
+#[test]
+fn a_blind_motion_is_the_best_of_several_rehearsals() {
+    let mut actor = shipped("student-push-classic.safetensors");
+    let mut n_actions = 0;
+    let mut idle_at_first = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+        n_actions += 1;
+        if n_actions <= EPISODE_STEPS {
+            action.fill(0.0);
+        } else {
+            actor.act(observation, goal, action);
+        }
+    };
+    let mut trials = trials(Task::Push, TrialMode::OpenLoop, 1);
+    let report = trials.run(0, &mut idle_at_first, &mut NoObserver).unwrap();
+    let rehearsed_m = report.rehearsed_m.unwrap();
+    assert!(rehearsed_m.iter().all(|distance_m| *distance_m < 0.04), "{rehearsed_m:?}");
 }
 
 #[test]

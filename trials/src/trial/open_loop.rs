@@ -6,11 +6,14 @@ use tandem_kinematics::{ArmWaypoint, Joints, Motion, Reason, Refusal, Waypoint};
 
 use crate::trial::coordination::coordinated;
 use crate::trial::outcome::{FailureCause, MotionRefusal};
-use crate::trial::rehearsal::TrialStart;
+use crate::trial::rehearsal::{Rollout, TrialStart};
 use crate::trial::rig::TrialRig;
+use crate::trial::robustness::Robustness;
 use crate::trial::runner::{REST_S, STEP_GAP_M, TrialExecution, TrialRunner};
 use crate::trial::{ActionSource, TrialError};
 
+/// Standard deviation of the noise in each number of the actions of all rehearsals but the first.
+const NOISE_STD: f32 = 0.1;
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
 /// Height by which a hand that withdraws first rises, metres.
@@ -18,21 +21,57 @@ const LIFT_M: f64 = 0.06;
 
 /// A motion that was planned before its execution.
 pub(super) struct PlannedMotion {
-    pub(super) waypoints: Result<Vec<Waypoint>, FailureCause>,
+    /// The waypoints of the tools; empty if an arm cannot reach them.
+    pub(super) waypoints: Vec<Waypoint>,
+    /// The motion through them, or the reason why there is none.
+    pub(super) motion: Result<Motion, FailureCause>,
     /// The final distances of the objects from their goals in the rehearsal, metres.
     pub(super) rehearsed_m: Vec<f64>,
     pub(super) n_steps: usize,
 }
 
 impl TrialRunner {
-    /// Converts the policy's episode in the training world to waypoints.
+    /// Plans the most robust of the configured number of episodes in the training world. The actions of all but the first
+    /// one have noise.
     pub(super) fn rehearse(
         &mut self,
         start: &TrialStart,
         at: &[Joints],
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let rollout = self.rehearsal.play(policy)?;
+        let rollout = self.rehearsal.play(policy, 0.0)?;
+        let first = self.planned(&rollout, start, at);
+        // The variants do not predict how an object that two hands hold behaves.
+        if self.task.shares_object() || self.config.n_rehearsals == 1 {
+            return Ok(first);
+        }
+        let mut best: Option<(Robustness, PlannedMotion)> = None;
+        if first.motion.is_ok() {
+            let robustness = self.rehearsal.robustness(&rollout, usize::MAX)?;
+            best = robustness.map(|robustness| (robustness, first));
+        }
+        for _ in 1..self.config.n_rehearsals {
+            let max_failed = best.as_ref().map_or(usize::MAX, |(most, _)| most.n_failed);
+            if max_failed == 0 {
+                break;
+            }
+            let rollout = self.rehearsal.play(policy, NOISE_STD)?;
+            let Some(robustness) = self.rehearsal.robustness(&rollout, max_failed)? else {
+                continue;
+            };
+            if best.as_ref().is_some_and(|(most, _)| robustness <= *most) {
+                continue;
+            }
+            let planned = self.planned(&rollout, start, at);
+            if planned.motion.is_ok() {
+                best = Some((robustness, planned));
+            }
+        }
+        Ok(best.map_or_else(|| self.planned(&rollout, start, at), |(_, planned)| planned))
+    }
+
+    /// Converts an episode in the training world to a motion.
+    fn planned(&self, rollout: &Rollout, start: &TrialStart, at: &[Joints]) -> PlannedMotion {
         let mut openings = vec![start.opening_m; start.hands.len()];
         let mut waypoints = vec![self.waypoint(&start.hands, &openings, at)];
         for step in &rollout.steps {
@@ -40,13 +79,20 @@ impl TrialRunner {
                 let action = &step.action[self.config.layout.action_of(ArmIndex(arm))];
                 *opening_m = self.mapping.opening_after(*opening_m, step.openings_m[arm], action);
             }
-            waypoints.push(self.waypoint(&step.hands, &openings, at));
+            let hands: Vec<DVec3> =
+                step.hands.iter().map(|hand| self.mapping.reachable_hand(*hand)).collect();
+            waypoints.push(self.waypoint(&hands, &openings, at));
         }
-        Ok(PlannedMotion {
-            waypoints: waypoints.into_iter().collect(),
-            rehearsed_m: rollout.goal_distances_m,
+        let (waypoints, motion) = match waypoints.into_iter().collect() {
+            Ok(waypoints) => self.blind_motion(waypoints, at),
+            Err(cause) => (Vec::new(), Err(cause)),
+        };
+        PlannedMotion {
+            waypoints,
+            motion,
+            rehearsed_m: rollout.goal_distances_m.clone(),
             n_steps: rollout.steps.len(),
-        })
+        }
     }
 
     /// Executes a motion that was planned before.
@@ -54,13 +100,9 @@ impl TrialRunner {
         &self,
         rig: &mut TrialRig<'_>,
         start: &TrialStart,
-        at: &[Joints],
         planned: PlannedMotion,
     ) -> TrialExecution {
-        let (waypoints, motion) = match planned.waypoints {
-            Ok(waypoints) => self.blind_motion(waypoints, at),
-            Err(cause) => (Vec::new(), Err(cause)),
-        };
+        let PlannedMotion { waypoints, motion, rehearsed_m, n_steps } = planned;
         let ended = motion.and_then(|motion| rig.play(motion, self.config.speed));
         let mut n_in_success = 0;
         let n_judged = self.task.success_steps();
@@ -74,9 +116,9 @@ impl TrialRunner {
         TrialExecution {
             ended,
             n_in_success,
-            n_steps: planned.n_steps,
+            n_steps,
             n_shortened: 0,
-            rehearsed_m: Some(planned.rehearsed_m),
+            rehearsed_m: Some(rehearsed_m),
             timed_out: false,
             waypoints,
         }
@@ -84,7 +126,7 @@ impl TrialRunner {
 
     /// Plans and checks the motion through `waypoints` from joint angles `at` (radians). If that brings the arms too close, one
     /// waits for the other, unless both hold one object. Returns the waypoints of the motion as well.
-    fn blind_motion(
+    pub(super) fn blind_motion(
         &self,
         waypoints: Vec<Waypoint>,
         at: &[Joints],
@@ -176,6 +218,7 @@ mod tests {
             mode: TrialMode::OpenLoop,
             block: Block::small([0.0; 2]),
             trained_half_m: 0.028,
+            n_rehearsals: 1,
             seed: 1,
             speed: 1.0,
             simulated: SimulatedConfig::default(),

@@ -1,10 +1,13 @@
 //! The start and goals of a trial, and the policy's episode in the training world.
 
 use glam::DVec3;
+use rand_chacha::ChaCha8Rng;
+use tandem_core::rng::standard_normal;
 use tandem_core::{ArmIndex, Contacts, Layout, Stream, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::{Block, SharedObject};
+use crate::trial::robustness::{Robustness, Variants};
 use crate::trial::shared_object::shared_object;
 use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
@@ -60,6 +63,9 @@ pub struct Rollout {
 /// The training world with blocks of the trial's size, or with its shared object.
 pub struct Rehearsal {
     env: Env,
+    variants: Variants,
+    /// The generator of the noise in rehearsals after the first one.
+    noise: ChaCha8Rng,
     layout: Layout,
     /// The number of control steps of an episode.
     n_steps: usize,
@@ -80,8 +86,11 @@ impl Rehearsal {
             object_mass_kg: block.mass_kg,
             ..WorldConfig::default()
         };
+        let env = Env::new(layout, &world)?;
         let mut rehearsal = Self {
-            env: Env::new(layout, &world)?,
+            variants: Variants::new(layout, &world, env.description().hand.action_m)?,
+            noise: episode_rng(0, 0, Stream::Exploration),
+            env,
             layout,
             n_steps: TaskSpec::from(layout).episode_steps(),
             half_m: f64::from(block.half_m),
@@ -119,39 +128,61 @@ impl Rehearsal {
         is_free: impl Fn(&TrialStart) -> bool,
     ) -> Result<TrialStart, TrialError> {
         let mut rng = episode_rng(seed, number, Stream::Reset);
+        self.noise = episode_rng(seed, number, Stream::Exploration);
         for _ in 0..N_DRAWS {
+            let before = rng.clone();
             self.env.reset(&mut rng, WorldSettings::default());
             let start = self.current_start();
             if self.has_room(&start) && is_free(&start) {
+                self.variants.reset(&before);
                 return Ok(start);
             }
         }
         Err(TrialError::NoRoom { half_m: self.half_m })
     }
 
-    /// Plays the policy's episode from the start that was drawn last.
+    /// Plays the policy's episode from the start that was drawn last, with noise of `noise_std` in its actions.
     ///
     /// # Errors
     /// Returns an error if the simulation fails.
-    pub fn play(&mut self, policy: &mut dyn ActionSource) -> Result<Rollout, SimError> {
+    pub fn play(
+        &mut self,
+        policy: &mut dyn ActionSource,
+        noise_std: f32,
+    ) -> Result<Rollout, SimError> {
+        let mut env = self.env.clone();
         let mut observation = vec![0.0; self.layout.n_observation()];
-        let goal = self.env.goal().to_vec();
+        let goal = env.goal().to_vec();
         let mut contacts = Contacts::NONE;
         let mut steps = Vec::with_capacity(self.n_steps);
         for _ in 0..self.n_steps {
-            self.env.observe(&mut observation);
+            env.observe(&mut observation);
             let mut action = vec![0.0; self.layout.n_action()];
             policy.act(&observation, &goal, &mut action);
+            if noise_std > 0.0 {
+                for number in &mut action {
+                    let noise = noise_std * standard_normal(&mut self.noise);
+                    *number = (*number + noise).clamp(-1.0, 1.0);
+                }
+            }
             let openings_m = self.openings_m(&observation);
-            contacts = contacts | self.env.step(&action)?;
-            self.env.observe(&mut observation);
+            contacts = contacts | env.step(&action)?;
+            env.observe(&mut observation);
             let hands = self.points(&observation, 0);
             steps.push(RolloutStep { hands, openings_m, action });
         }
-        let distance = |(at, goal): (DVec3, DVec3)| (at - goal).length();
-        let objects = self.above_rest(self.points(&observation, 3));
-        let goal_distances_m = objects.into_iter().zip(self.goals()).map(distance).collect();
+        let goal_distances_m = goal_distances_m(&env, &observation);
         Ok(Rollout { steps, goal_distances_m, contacts })
+    }
+
+    /// Returns the robustness of a rollout from the start that was drawn last, or `None` if it fails in more than
+    /// `max_failed` variants of the training world.
+    pub(super) fn robustness(
+        &self,
+        rollout: &Rollout,
+        max_failed: usize,
+    ) -> Result<Option<Robustness>, SimError> {
+        self.variants.robustness(rollout, max_failed)
     }
 
     fn current_start(&self) -> TrialStart {
@@ -219,6 +250,16 @@ impl Rehearsal {
                     places[0].iter().all(|object| horizontal_m(*hand, *object) >= hand_m)
                 })
     }
+}
+
+/// Returns the distance of each arm's object, in `observation` of `env`, from its goal, metres.
+pub(super) fn goal_distances_m(env: &Env, observation: &[f32]) -> Vec<f64> {
+    let layout = env.layout();
+    let distance = |arm: ArmIndex| {
+        let object = point(&observation[layout.observation_of(arm)][3..]);
+        (object - point(&env.goal()[layout.goal_of(arm)])).length()
+    };
+    layout.arms().map(distance).collect()
 }
 
 fn point(numbers: &[f32]) -> DVec3 {

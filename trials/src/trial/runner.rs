@@ -3,8 +3,8 @@
 use glam::DVec3;
 use tandem_core::{ArmIndex, TaskSpec};
 use tandem_kinematics::{
-    ArmWaypoint, CheckSettings, Joints, Motion, PlanError, PlanSettings, ReachError, Waypoint,
-    check, plan,
+    ArmWaypoint, CheckSettings, Joints, Motion, PlacedArm, PlanError, PlanSettings, ReachError,
+    Waypoint, check, plan,
 };
 use tandem_sim::SimError;
 
@@ -32,6 +32,9 @@ pub(super) const REST_S: f64 = 0.5;
 /// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
 /// step can start.
 pub(super) const STEP_GAP_M: f64 = 0.025;
+/// Angle between a joint of an arm that starts a trial and the end of the joint's range, radians: a little more than the
+/// executor demands of motions.
+const RANGE_ROOM_RAD: f64 = 0.02;
 /// Friction of the twin, as a share of the pair's.
 const TWIN_FRICTION: f32 = 0.8;
 
@@ -112,7 +115,7 @@ impl TrialRunner {
         let goals = Goals { at_m, tolerance_m: self.task.tolerance() };
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
-            Some(motion) => self.open_loop(&mut rig, &start, &at, motion),
+            Some(motion) => self.open_loop(&mut rig, &start, motion),
             None => self.closed_loop(&mut rig, &start, &at, policy),
         };
         Ok(self.report(number, &start, &initial, &rig, execution))
@@ -209,8 +212,13 @@ impl TrialRunner {
         let distance = |(arm, goal): (usize, &DVec3)| {
             (self.mapping.object_in_own(ArmIndex(arm), ends[arm].at_m) - *goal).length()
         };
+        let (waypoints, motion) = match execution.ended {
+            Ok(()) => self.blind_motion(execution.waypoints, at),
+            Err(cause) => (Vec::new(), Err(cause)),
+        };
         Ok(PlannedMotion {
-            waypoints: execution.ended.map(|()| execution.waypoints),
+            waypoints,
+            motion,
             rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
             n_steps: execution.n_steps,
         })
@@ -257,8 +265,10 @@ impl TrialRunner {
         let Self { mapping, check, .. } = self;
         let is_free = |start: &TrialStart| {
             // An arm that cannot reach the start is reported later.
-            start_angles(mapping, start)
-                .map_or(true, |at| mapping.cell().gaps(&at).arms_m >= check.arms_gap_m)
+            start_angles(mapping, start).map_or(true, |at| {
+                mapping.cell().gaps(&at).arms_m >= check.arms_gap_m
+                    && mapping.cell().arms.iter().zip(&at).all(|(placed, at)| has_range(placed, at))
+            })
         };
         self.rehearsal.start(self.config.seed, number, is_free)
     }
@@ -296,6 +306,14 @@ impl TrialRunner {
     }
 }
 
+/// Returns whether every joint keeps [`RANGE_ROOM_RAD`] to the ends of its range.
+fn has_range(placed: &PlacedArm, at: &Joints) -> bool {
+    placed.model.joints.iter().zip(at.iter()).all(|(joint, angle)| {
+        let [low, high] = joint.range_rad;
+        (angle - low).min(high - angle) >= RANGE_ROOM_RAD
+    })
+}
+
 /// Returns the joint angles of the arms at `start`, radians.
 fn start_angles(mapping: &Mapping, start: &TrialStart) -> Result<Vec<Joints>, TrialError> {
     let angles = |(arm, hand): (usize, &DVec3)| {
@@ -326,5 +344,38 @@ fn twin_of(simulated: &SimulatedConfig) -> SimulatedConfig {
         },
         table_friction: TWIN_FRICTION * simulated.table_friction,
         ..simulated.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Layout, Task};
+
+    use super::*;
+    use crate::trial::mapping::TRAINED_HALF_M;
+
+    #[test]
+    fn arms_start_where_the_executor_lets_them_move() {
+        let config = TrialConfig {
+            layout: Layout::new(Task::SharedPickAndPlace, 2),
+            mode: TrialMode::ClosedLoop,
+            block: Block::small([0.0; 2]),
+            trained_half_m: TRAINED_HALF_M,
+            n_rehearsals: 1,
+            seed: 2,
+            speed: 1.0,
+            simulated: SimulatedConfig::default(),
+            time_limit_s: 120.0,
+        };
+        let least_rad = tandem_bridge::executor::Settings::default().range_margin_rad;
+        let mut runner = TrialRunner::new(config).unwrap();
+        for number in 0..50 {
+            let start = runner.start(number).unwrap();
+            for at in start_angles(&runner.mapping, &start).unwrap() {
+                let elbow = &runner.mapping.cell().arms[0].model.joints[2];
+                let [low, high] = elbow.range_rad.map(|end| (at[2] - end).abs());
+                assert!(low.min(high) > least_rad, "trial {number}: {at:?}");
+            }
+        }
     }
 }

@@ -4,6 +4,10 @@ use glam::DVec3;
 use tandem_sim::description::WorldDescription;
 use tandem_sim::reach::Reach;
 
+/// Distance that the hand keeps from the smallest radius that the arm reaches, metres: the bridge refuses motions that
+/// bring an elbow within one degree of the end of its range.
+const FOLDED_ROOM_M: f32 = 0.004;
+
 /// The servo and the gripper of the training world's hand.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingHand {
@@ -80,7 +84,14 @@ impl TrainingHand {
     pub fn reachable(&self, at: DVec3) -> DVec3 {
         let [low, high] = self.workspace_m;
         let at = at.clamp(low, high);
-        self.reach.map_or(at, |reach| reach.clamp(at.as_vec3()).as_dvec3())
+        self.reach.map_or(at, |reach| {
+            let reached = reach.clamp(at.as_vec3());
+            let [nearest_m, _] = reach.radii_m(reached.z);
+            let radius_m = reach.radius_m(reached.to_array());
+            let missing_m = (nearest_m + FOLDED_ROOM_M - radius_m).max(0.0);
+            let outward = (reached - reach.axis(reached.z)) / radius_m;
+            (reached + outward * missing_m).as_dvec3()
+        })
     }
 
     /// Returns the velocity at the end of a step per displacement in it, in metres per step and metre, for a body that
@@ -142,6 +153,8 @@ mod tests {
         let shared = hand_of(Task::SharedPush);
         let (far, _) = shared.after(DVec3::new(0.2, 0.15, 0.3), DVec3::ZERO, &ahead);
         assert!((far.xy() + DVec2::X * 0.22).length() < 0.376, "{far}: out of the arm's reach");
+        let folded = shared.reachable(DVec3::new(-0.2, 0.0, 0.25)).xy() + DVec2::X * 0.22;
+        assert!((folded.length() - 0.186).abs() < 1e-6, "{folded}: the elbow is folded");
         let slow = hand_of(Task::CarryBar);
         let (_, velocity) = slow.after(DVec3::Z, DVec3::ZERO, &[1.0, 1.0, -1.0, 0.0]);
         assert!(velocity.length() < 0.2 + 1e-9, "{velocity}");

@@ -1,0 +1,237 @@
+//! Rehearsed motions that also succeed where the arms' world differs from the training world.
+//!
+//! A blind motion cannot react to the differences between the world of its rehearsal and the one of its execution. Each
+//! variant of the training world differs in friction and mass, and its hands are displaced by a few millimetres. Of
+//! several rehearsals, the one is executed whose actions reach the goals in the most variants.
+
+use std::cmp::Ordering;
+
+use rand_chacha::ChaCha8Rng;
+use tandem_core::{ArmIndex, Contacts, Layout, TaskSpec, WorldSettings};
+use tandem_sim::{Env, Friction, SimError, WorldConfig};
+
+use crate::trial::rehearsal::{Rollout, goal_distances_m};
+
+/// The differences of each variant.
+const DIFFERENCES: [Difference; 9] = [
+    Difference { friction: 1.0, mass: 1.0, offset_m: [0.0, 0.0] },
+    Difference { friction: 0.8, mass: 1.0, offset_m: [0.003, 0.0] },
+    Difference { friction: 1.2, mass: 1.0, offset_m: [-0.003, 0.0] },
+    Difference { friction: 0.8, mass: 1.0, offset_m: [0.0, 0.003] },
+    Difference { friction: 1.2, mass: 1.0, offset_m: [0.0, -0.003] },
+    Difference { friction: 1.2, mass: 0.8, offset_m: [0.004, 0.004] },
+    Difference { friction: 0.8, mass: 1.2, offset_m: [-0.004, 0.004] },
+    Difference { friction: 1.0, mass: 1.2, offset_m: [-0.004, -0.004] },
+    Difference { friction: 1.0, mass: 0.8, offset_m: [0.004, -0.004] },
+];
+/// Share of the tolerance within which a robust motion brings the objects to their goals.
+const USED_TOLERANCE: f64 = 0.8;
+
+/// The difference between a variant and the training world.
+struct Difference {
+    /// Factor of all friction coefficients.
+    friction: f32,
+    /// Factor of the objects' masses.
+    mass: f32,
+    /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by 180°.
+    offset_m: [f32; 2],
+}
+
+/// A world that differs from the training world.
+struct Variant {
+    env: Env,
+    /// Displacement of the hands along x and y, frame of the first arm, as a share of an action's.
+    offset: [f32; 2],
+}
+
+/// The variants of a training world, at the start of an episode.
+pub(super) struct Variants {
+    layout: Layout,
+    worlds: Vec<Variant>,
+}
+
+/// The success of a rollout's actions in the variants. A greater one is better.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Robustness {
+    /// The number of variants in which the actions fail or lead to contacts.
+    pub(super) n_failed: usize,
+    /// The mean over the variants of the largest final distance of an object from its goal, metres.
+    mean_distance_m: f64,
+}
+
+impl Variants {
+    /// Creates the variants of the world of `layout` with `config` and actions that move a hand by `action_m` metres.
+    pub(super) fn new(
+        layout: Layout,
+        config: &WorldConfig,
+        action_m: f32,
+    ) -> Result<Self, SimError> {
+        let variant = |difference: &Difference| {
+            let env = Env::new(layout, &difference.applied_to(config))?;
+            Ok(Variant { env, offset: difference.offset_m.map(|offset_m| offset_m / action_m) })
+        };
+        let worlds = DIFFERENCES.iter().map(variant).collect::<Result<_, SimError>>()?;
+        Ok(Self { layout, worlds })
+    }
+
+    /// Starts the episode of which `rng` draws the start.
+    pub(super) fn reset(&mut self, rng: &ChaCha8Rng) {
+        for variant in &mut self.worlds {
+            variant.env.reset(&mut rng.clone(), WorldSettings::default());
+        }
+    }
+
+    /// Executes the actions of `rollout` in all variants. Returns `None` if they fail in more than `max_failed` variants.
+    pub(super) fn robustness(
+        &self,
+        rollout: &Rollout,
+        max_failed: usize,
+    ) -> Result<Option<Robustness>, SimError> {
+        let mut n_failed = 0;
+        let mut sum_m = 0.0;
+        for variant in &self.worlds {
+            let (succeeds, distance_m) = self.play(variant, rollout)?;
+            n_failed += usize::from(!succeeds);
+            sum_m += distance_m;
+            if n_failed > max_failed {
+                return Ok(None);
+            }
+        }
+        Ok(Some(Robustness { n_failed, mean_distance_m: sum_m / self.worlds.len() as f64 }))
+    }
+
+    /// Returns whether the actions succeed without contacts, and the largest final distance of an object, metres.
+    fn play(&self, variant: &Variant, rollout: &Rollout) -> Result<(bool, f64), SimError> {
+        let (env, contacts) = self.executed(variant, rollout)?;
+        let mut observation = vec![0.0; self.layout.n_observation()];
+        env.observe(&mut observation);
+        let distance_m = goal_distances_m(&env, &observation).into_iter().fold(0.0, f64::max);
+        let task = TaskSpec::from(self.layout);
+        let succeeds = task.is_success(&observation, env.goal())
+            && distance_m <= USED_TOLERANCE * f64::from(task.tolerance())
+            && contacts == Contacts::NONE;
+        Ok((succeeds, distance_m))
+    }
+
+    /// Executes the actions with displaced hands.
+    fn executed(&self, variant: &Variant, rollout: &Rollout) -> Result<(Env, Contacts), SimError> {
+        let mut env = variant.env.clone();
+        let mut contacts = Contacts::NONE;
+        for (idx, step) in rollout.steps.iter().enumerate() {
+            let mut action = step.action.clone();
+            if idx == 0 {
+                for arm in self.layout.arms() {
+                    let first = self.layout.action_of(arm).start;
+                    let sign = if arm == ArmIndex(0) { 1.0 } else { -1.0 };
+                    action[first] += sign * variant.offset[0];
+                    action[first + 1] += sign * variant.offset[1];
+                }
+            }
+            contacts = contacts | env.step(&action)?;
+        }
+        Ok((env, contacts))
+    }
+}
+
+impl PartialOrd for Robustness {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        let fewer = other.n_failed.cmp(&self.n_failed);
+        Some(fewer.then(other.mean_distance_m.total_cmp(&self.mean_distance_m)))
+    }
+}
+
+impl Difference {
+    fn applied_to(&self, config: &WorldConfig) -> WorldConfig {
+        let times = |value: f32| value * self.friction;
+        let surfaces = |friction: Friction| Friction {
+            pads: times(friction.pads),
+            object: times(friction.object),
+        };
+        WorldConfig {
+            object_mass_kg: config.object_mass_kg * self.mass,
+            table_friction: times(config.table_friction),
+            push: surfaces(config.push),
+            pick_and_place: surfaces(config.pick_and_place),
+            carry_bar: surfaces(config.carry_bar),
+            rubber_pads: times(config.rubber_pads),
+            ..config.clone()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Stream, Task, episode_rng};
+
+    use super::*;
+    use crate::trial::rehearsal::RolloutStep;
+
+    fn started(layout: Layout) -> (Env, Variants) {
+        let config = WorldConfig::default();
+        let mut env = Env::new(layout, &config).unwrap();
+        let action_m = env.description().hand.action_m;
+        let mut variants = Variants::new(layout, &config, action_m).unwrap();
+        let rng = episode_rng(1, 2, Stream::Reset);
+        env.reset(&mut rng.clone(), WorldSettings::default());
+        variants.reset(&rng);
+        (env, variants)
+    }
+
+    fn observed(env: &Env) -> Vec<f32> {
+        let mut observation = vec![0.0; env.layout().n_observation()];
+        env.observe(&mut observation);
+        observation
+    }
+
+    #[test]
+    fn variants_start_like_the_training_world() {
+        for task in [Task::Push, Task::SharedPickAndPlace, Task::CarryBar] {
+            let (env, variants) = started(Layout::new(task, 2));
+            for variant in &variants.worlds {
+                assert_eq!(observed(&variant.env), observed(&env), "{task}");
+                assert_eq!(variant.env.goal(), env.goal(), "{task}");
+            }
+        }
+    }
+
+    #[test]
+    fn hands_are_displaced_and_idle_ones_fail_everywhere() {
+        let layout = Layout::new(Task::SharedPush, 2);
+        let (env, variants) = started(layout);
+        let idle = vec![0.0; layout.n_action()];
+        let step = RolloutStep { hands: Vec::new(), openings_m: Vec::new(), action: idle };
+        let rollout = Rollout {
+            steps: vec![step; 6],
+            goal_distances_m: vec![0.0; 2],
+            contacts: Contacts::NONE,
+        };
+        for (variant, difference) in variants.worlds.iter().zip(&DIFFERENCES) {
+            let (after, _) = variants.executed(variant, &rollout).unwrap();
+            let (before, after) = (observed(&env), observed(&after));
+            let second = layout.observation_of(ArmIndex(1)).start;
+            for axis in 0..2 {
+                let offset_m = difference.offset_m[axis];
+                for (at, offset_m) in [(axis, offset_m), (second + axis, -offset_m)] {
+                    let moved_m = after[at] - before[at];
+                    assert!((moved_m - offset_m).abs() < 5e-4, "{moved_m} m");
+                }
+            }
+        }
+        let robustness = variants.robustness(&rollout, usize::MAX).unwrap().unwrap();
+        assert_eq!(robustness.n_failed, DIFFERENCES.len());
+        assert_eq!(variants.robustness(&rollout, 3).unwrap(), None);
+        let better = Robustness { n_failed: 1, mean_distance_m: 0.2 };
+        assert!(better > robustness && better < Robustness { mean_distance_m: 0.1, ..better });
+    }
+
+    #[test]
+    fn variants_differ_in_friction_and_mass() {
+        let config = WorldConfig::default();
+        let changed = DIFFERENCES[7].applied_to(&config);
+        assert_eq!(changed.object_mass_kg, config.object_mass_kg * 1.2);
+        let slippery = DIFFERENCES[1].applied_to(&config);
+        assert_eq!(slippery.table_friction, config.table_friction * 0.8);
+        assert_eq!(slippery.pick_and_place.pads, config.pick_and_place.pads * 0.8);
+        assert_eq!(slippery.rubber_pads, config.rubber_pads * 0.8);
+    }
+}
