@@ -110,7 +110,7 @@ class Run:
             self.services.append(service)
             return service
 
-        teacher_at = start("teacher", "teacher", "--policy", ROOT / "policies/teacher-push.safetensors", "--ledger", work / "ledger.sqlite").address()
+        teacher_at = start("teacher", "teacher", "--policy", ROOT / "policies/teacher-push-classic.safetensors", "--ledger", work / "ledger.sqlite").address()
         # The learner keeps its port, so that workers find it after a restart.
         learner_at = f"127.0.0.1:{free_port()}"
         self.learner = start(

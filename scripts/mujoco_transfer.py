@@ -20,14 +20,14 @@ from mujoco_world import ContactModel, MujocoWorld
 
 ROOT = Path(__file__).resolve().parent.parent
 SHIPPED = [
-    ROOT / "policies" / f"{role}-{task}.safetensors"
+    ROOT / "policies" / f"{role}-{task}-classic.safetensors"
     for task in ("push", "pick-and-place")
     for role in ("student", "teacher")
 ]
 EXAMPLES = """examples:
   python scripts/mujoco_transfer.py                               all shipped policies, 240 goals each
-  python scripts/mujoco_transfer.py policies/student-push.safetensors --episodes 60 --json
-  python scripts/mujoco_transfer.py policies/teacher-push.safetensors --arms 2     two copies of the teacher
+  python scripts/mujoco_transfer.py policies/student-push-classic.safetensors --episodes 60 --json
+  python scripts/mujoco_transfer.py policies/teacher-push-classic.safetensors --arms 2     two copies of the teacher
   python scripts/mujoco_transfer.py --check                       compares the engines without policies
   python scripts/mujoco_transfer.py --mujoco-defaults             with MuJoCo's own contact parameters
 

@@ -24,7 +24,7 @@ expect 64 'unexpected argument' "$tandem" train --no-such-flag
 expect 64 'ddpg.discont' "$tandem" train --set ddpg.discont=0.9 --out "$work/none"
 expect 64 'cannot read run file' "$tandem" train --run "$work/missing.toml"
 expect 65 'missing.safetensors' "$tandem" eval --policy "$work/missing.safetensors"
-head -c 1000 policies/teacher-push.safetensors >"$work/torn.safetensors"
+head -c 1000 policies/teacher-push-classic.safetensors >"$work/torn.safetensors"
 head -c 1000 onnx/tests/pytorch/sb3-actor.dynamo.onnx >"$work/torn.onnx"
 expect 65 'not a complete ONNX file' "$tandem" policy show "$work/torn.onnx"
 expect 65 'torn.safetensors' "$tandem" eval --policy "$work/torn.safetensors"
@@ -68,8 +68,8 @@ echo '- other programs read what it wrote'
 python3 -m venv "$work/venv"
 "$work/venv/bin/pip" install --quiet --requirement scripts/requirements.txt
 "$work/venv/bin/python" scripts/read_mcap.py "$work"/run/mcap/*.mcap
-cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push.safetensors >"$work/probe.json"
-"$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
+cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push-classic.safetensors >"$work/probe.json"
+"$work/venv/bin/python" scripts/check_policy.py policies/teacher-push-classic.safetensors "$work/probe.json"
 for name in teacher-push student-push teacher-pick-and-place student-pick-and-place; do
   file=policies/$name.safetensors
   "$tandem" policy export "$file" --onnx "$work/actor.onnx" --critic-onnx "$work/critic.onnx" >/dev/null
@@ -84,7 +84,7 @@ for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/nu
 
 echo '- a policy pushes in another physics engine'
 "$work/venv/bin/pip" install --quiet --requirement scripts/requirements-mujoco.txt
-"$work/venv/bin/python" scripts/mujoco_transfer.py policies/teacher-push.safetensors --episodes 4 --json >"$work/transfer.json"
+"$work/venv/bin/python" scripts/mujoco_transfer.py policies/teacher-push-classic.safetensors --episodes 4 --json >"$work/transfer.json"
 python3 - "$work/transfer.json" <<'PY'
 import json, sys
 [result] = json.load(open(sys.argv[1]))
@@ -93,7 +93,7 @@ PY
 
 echo '- a client that knows nothing of it talks to a teacher'
 head -c 32 /dev/urandom | base64 >"$work/token"
-"$tandem" teacher --policy policies/teacher-push.safetensors --listen 127.0.0.1:0 --ledger "$work/ledger.sqlite" \
+"$tandem" teacher --policy policies/teacher-push-classic.safetensors --listen 127.0.0.1:0 --ledger "$work/ledger.sqlite" \
   --token-file "$work/token" >"$work/listening" 2>"$work/teacher.log" &
 teacher=$!
 trap 'kill "$teacher" 2>/dev/null || true; rm -rf "$work"' EXIT

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use tandem_core::{Task, World};
 use tandem_policy::Policy;
 use tandem_rl::config::Recipe;
 use tandem_teacher::policy::is_onnx;
@@ -23,7 +24,7 @@ pub(crate) fn load(path: &Path) -> Result<Policy, Failed> {
 /// Finds the shipped teacher of a task that was trained with `recipe`, or with the default recipe if there is none.
 pub(crate) fn shipped_teacher_of(recipe: Recipe, task: &str) -> Result<PathBuf, Failed> {
     if recipe == Recipe::Paper
-        && let Ok(path) = shipped_teacher(&format!("{task}-paper"))
+        && let Ok(path) = find_teacher(task, "-paper")
     {
         return Ok(path);
     }
@@ -32,7 +33,11 @@ pub(crate) fn shipped_teacher_of(recipe: Recipe, task: &str) -> Result<PathBuf, 
 
 /// Finds the shipped teacher of a task: in the working directory, next to the program, or in the source tree.
 pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
-    let name = format!("policies/teacher-{task}.safetensors");
+    find_teacher(task, "")
+}
+
+fn find_teacher(task: &str, suffix: &str) -> Result<PathBuf, Failed> {
+    let name = format!("policies/teacher-{}{suffix}.safetensors", shipped_name(task));
     let next_to_program =
         std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(&name)));
     let candidates = [
@@ -47,4 +52,35 @@ pub(crate) fn shipped_teacher(task: &str) -> Result<PathBuf, Failed> {
              and name its policy/best.safetensors with --teacher"
         ))
     })
+}
+
+/// Returns the name under which the policies of a task ship: that of the task, and its world unless that is the default.
+fn shipped_name(task: &str) -> String {
+    let Ok(built_in) = task.parse::<Task>() else { return task.to_owned() };
+    let name = built_in.in_world(World::Classic).unwrap_or(built_in).name();
+    match (built_in.in_world(World::DEFAULT), built_in.world()) {
+        (None, _) | (_, World::DEFAULT) => name.to_owned(),
+        (Some(_), world) => format!("{name}-{world}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn policies_of_other_worlds_than_the_default_one_ship_under_names_with_their_worlds() {
+        let is_default = |task: Task| task.world() == World::DEFAULT;
+        for task in Task::CLASSIC.into_iter().chain(Task::SHARED) {
+            let plain = task.in_world(World::Classic).unwrap_or(task).name();
+            let expected = if is_default(task) {
+                plain.to_owned()
+            } else {
+                format!("{plain}-{}", task.world())
+            };
+            assert_eq!(shipped_name(task.name()), expected);
+        }
+        assert_eq!(shipped_name("carry-bar"), "carry-bar");
+        assert_eq!(shipped_name("FetchPush-v4"), "FetchPush-v4");
+    }
 }

@@ -167,7 +167,7 @@ fn metrics(out: &Path) -> Vec<Value> {
 
 fn evaluate_with_threads(n_threads: &str) -> Value {
     let mut args: Vec<String> = vec!["eval".into(), "--json".into(), "--policy".into()];
-    args.push("policies/student-push.safetensors".into());
+    args.push("policies/student-push-classic.safetensors".into());
     args.extend(["--episodes".into(), "40".into(), "--seed".into(), "5".into()]);
     let mut evaluation = last_line(tandem(&args).env("RAYON_NUM_THREADS", n_threads));
     evaluation.as_object_mut().expect("an object").remove("steps_per_s").expect("a speed");

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-const TEACHER: &str = "policies/teacher-push.safetensors";
+const TEACHER: &str = "policies/teacher-push-classic.safetensors";
 /// An actor that PyTorch exported, with tanh between its layers.
 const FOREIGN: &str = "onnx/tests/pytorch/normalized-tanh-actor.dynamo.onnx";
 

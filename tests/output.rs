@@ -9,7 +9,8 @@ use std::process::{Command, Output, Stdio};
 use tempfile::TempDir;
 
 const TANDEM: &str = env!("CARGO_BIN_EXE_tandem");
-const POLICY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
+const POLICY: &str =
+    concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push-classic.safetensors");
 
 /// A short run with one arm and no teacher.
 const SHORT_RUN: &str = r#"

@@ -45,7 +45,7 @@ const KINDS: [Kind; 5] =
 fn teacher(task: Task) -> Actor {
     let classic =
         task.of_one_arm().in_world(World::Classic).expect("every teacher has a classic task");
-    let name = format!("policies/teacher-{classic}.safetensors");
+    let name = format!("policies/teacher-{classic}-classic.safetensors");
     let policy = Policy::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).expect("ships");
     policy.actor().expect("usable")
 }
@@ -418,7 +418,7 @@ fn a_film_of_an_evaluation_has_the_bytes_of_one_of_its_log() {
     let directory = tempfile::tempdir().expect("a directory");
     let path = |name: &str| directory.path().join(name);
     let (log, played, replayed) = (path("one.mcap"), path("played.gif"), path("replayed.gif"));
-    let policy = Path::new("policies/teacher-push.safetensors");
+    let policy = Path::new("policies/teacher-push-classic.safetensors");
     let film = ["--film-size", "96x64", "--film"];
     let eval = ["eval", "--episodes", "1", "--policy"];
     let output = Command::new(env!("CARGO_BIN_EXE_tandem"))

@@ -232,7 +232,8 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     assert!(message.contains("1 of 2 runs failed"), "{message}");
     assert!(text(&failed.stdout).contains("1 of 2"), "{}", text(&failed.stdout));
 
-    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+    let shipped =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
     fs::copy(shipped, &teacher).expect("copies");
     let again = sweep(&file, &out, &["--json"]).output().expect("runs");
     assert!(text(&again.stderr).contains("failed before"), "{}", text(&again.stderr));

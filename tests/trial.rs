@@ -5,9 +5,9 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-const STUDENT: &str = "policies/student-push.safetensors";
-const TEACHER: &str = "policies/teacher-push.safetensors";
-const GRASPING_TEACHER: &str = "policies/teacher-pick-and-place.safetensors";
+const STUDENT: &str = "policies/student-push-classic.safetensors";
+const TEACHER: &str = "policies/teacher-push-classic.safetensors";
+const GRASPING_TEACHER: &str = "policies/teacher-pick-and-place-classic.safetensors";
 
 fn trial(out: &Path, more: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
@@ -39,10 +39,10 @@ fn trials_are_evaluated_and_recorded() {
         assert!(same_start.clone().all(|other| other["goals"] == row["goals"]));
     }
     let is_closed_loop =
-        |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push";
+        |row: &&Value| row["mode"] == "closed-loop" && row["subject"] == "student-push-classic";
     assert!(rows.iter().filter(is_closed_loop).all(|row| row["success"] == true), "{rows:?}");
     assert!(dir.path().join("report.html").exists());
-    let motion = dir.path().join("motions/student-push-twin-0000.json");
+    let motion = dir.path().join("motions/student-push-classic-twin-0000.json");
     let motion = std::fs::read_to_string(motion).expect("written");
     let motion: Value = serde_json::from_str(&motion).expect("an object");
     assert!(motion["way_points"].as_array().is_some_and(|points| points.len() > 10));

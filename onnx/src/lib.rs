@@ -13,7 +13,7 @@
 //! use tandem_onnx::{BoundNetwork, Model, Role, export};
 //! use tandem_policy::Policy;
 //!
-//! let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../policies/teacher-push.safetensors");
+//! let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../policies/teacher-push-classic.safetensors");
 //! let policy = Policy::load(path.as_ref())?;
 //! let model = Model::decode(&export::actor(&policy)?)?;
 //! let mut actor = BoundNetwork::new(&model, Role::Actor, &policy.layout)?;

@@ -11,7 +11,7 @@
 //! ```
 //! use tandem_policy::Policy;
 //!
-//! let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../policies/student-push.safetensors");
+//! let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../policies/student-push-classic.safetensors");
 //! let policy = Policy::load(path.as_ref())?;
 //! let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
 //!

@@ -11,7 +11,7 @@ import numpy as np
 import tandem
 from services import ROOT, service
 
-POLICY = str(ROOT / "policies/teacher-push.safetensors")
+POLICY = str(ROOT / "policies/teacher-push-classic.safetensors")
 HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
 BUSY = {"late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"}
 """Reasons for which a busy machine may stop the arms."""

@@ -87,7 +87,7 @@ def test_a_shipped_policy_succeeds(path):
 
 def test_properties_come_from_the_file():
     safetensors = pytest.importorskip("safetensors.numpy")
-    path = ROOT / "policies/student-pick-and-place.safetensors"
+    path = ROOT / "policies/student-pick-and-place-classic.safetensors"
     policy = tandem.load_policy(path)
     assert (policy.task, policy.n_arms, policy.env_id) == ("pick-and-place", 2, "tandem/TwoArmPickAndPlace-v0")
     assert len(policy.digest) == 64 and policy.digest[:12] in repr(policy)

@@ -12,8 +12,8 @@ from tandem._grpc import open_channel
 from tandem._proto import policy_pb2 as pb
 from tandem._proto import policy_pb2_grpc
 
-TEACHER = ROOT / "policies" / "teacher-push.safetensors"
-STUDENT = ROOT / "policies" / "student-push.safetensors"
+TEACHER = ROOT / "policies" / "teacher-push-classic.safetensors"
+STUDENT = ROOT / "policies" / "student-push-classic.safetensors"
 RNG = np.random.default_rng(4)
 
 

@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn without_a_perturbation_the_result_is_that_of_an_evaluation() {
-        let path = Path::new("policies/student-push.safetensors");
+        let path = Path::new("policies/student-push-classic.safetensors");
         let policy = policy_file::load(path).unwrap();
         let subject = EvaluatedPolicy::new(policy.clone(), path).unwrap();
         let (layout, goals) = (subject.layout(), (6, 3));

@@ -78,7 +78,7 @@ impl Cluster {
         let log = |name: &str| dir.join(format!("{name}.log"));
         let path = |path: PathBuf| path.into_os_string();
         let policy =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
         let args = ["teacher".into(), "--policy".into(), path(policy), "--ledger".into()];
         let args = args.into_iter().chain([path(ledger_path(dir))]).collect();
         let (teacher, teacher_at) = Process::serve(args, &log("teacher"));

@@ -300,7 +300,8 @@ impl PersistentState {
 fn teacher_policy() -> &'static Policy {
     static POLICY: OnceLock<Policy> = OnceLock::new();
     POLICY.get_or_init(|| {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
+        let path =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
         Policy::load(&path).expect("ships")
     })
 }

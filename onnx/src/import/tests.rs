@@ -18,8 +18,12 @@ fn shipped(name: &str) -> Policy {
 
 #[test]
 fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
-    for name in ["teacher-push", "student-push", "teacher-pick-and-place", "student-pick-and-place"]
-    {
+    for name in [
+        "teacher-push-classic",
+        "student-push-classic",
+        "teacher-pick-and-place-classic",
+        "student-pick-and-place-classic",
+    ] {
         let policy = shipped(name);
         let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
         let critic = Model::decode(&export::critic(&policy).unwrap()).unwrap();
@@ -38,7 +42,7 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
 
 #[test]
 fn a_policy_without_a_critic_says_so_and_values_nothing() {
-    let policy = shipped("teacher-push");
+    let policy = shipped("teacher-push-classic");
     let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
     let imported = import(&actor, None, &policy.layout).unwrap();
     assert_eq!(imported.actor, policy.actor);

@@ -115,8 +115,9 @@ mod tests {
     fn an_exported_teacher_acts_and_values_as_its_policy_file() {
         const N_ROWS: usize = 3;
         let directory = tempfile::tempdir().unwrap();
-        let [actor, critic] = exported(directory.path(), "teacher-push.safetensors");
-        let mut file = OneArmPolicy::load(&policy_file("teacher-push.safetensors")).unwrap();
+        let [actor, critic] = exported(directory.path(), "teacher-push-classic.safetensors");
+        let mut file =
+            OneArmPolicy::load(&policy_file("teacher-push-classic.safetensors")).unwrap();
         let mut models = load(&actor, Some(&critic)).unwrap();
         let mut alone = load(&actor, None).unwrap();
         assert_eq!(models.layout(), file.layout());
@@ -143,7 +144,7 @@ mod tests {
     #[test]
     fn models_that_cannot_teach_are_refused() {
         let directory = tempfile::tempdir().unwrap();
-        let [actor, critic] = exported(directory.path(), "student-push.safetensors");
+        let [actor, critic] = exported(directory.path(), "student-push-classic.safetensors");
         let refusal = |policy: &Path, critic: Option<&Path>| {
             let error = load(policy, critic).err().expect("must be refused");
             tandem_core::text::error_chain(&error)
@@ -153,7 +154,7 @@ mod tests {
             "a teacher needs a policy for 1 arm with 1 value, this one is for 2 with 2"
         );
         assert_eq!(
-            refusal(&policy_file("teacher-push.safetensors"), Some(&critic)),
+            refusal(&policy_file("teacher-push-classic.safetensors"), Some(&critic)),
             "a critic is given apart only for an ONNX model: a policy file contains its own"
         );
         let swapped = refusal(&critic, Some(&actor));
