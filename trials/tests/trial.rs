@@ -71,6 +71,24 @@ fn a_hand_that_would_press_on_its_block_continues() {
 }
 
 #[test]
+fn a_policy_that_fails_plays_another_episode() {
+    let mut actor = shipped("student-push-classic.safetensors");
+    let mut n_actions = 0;
+    let mut idle_at_first = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+        n_actions += 1;
+        if n_actions <= EPISODE_STEPS {
+            action.fill(0.0);
+        } else {
+            actor.act(observation, goal, action);
+        }
+    };
+    let mut trials = trials(Task::Push, TrialMode::ClosedLoop, 2);
+    let report = trials.run(0, &mut idle_at_first, &mut NoObserver).unwrap();
+    assert_eq!(report.cause, None);
+    assert!(report.n_steps > EPISODE_STEPS, "{}", report.n_steps);
+}
+
+#[test]
 fn a_trial_does_not_depend_on_the_trials_before_it() {
     let mut actor = shipped("student-push-classic.safetensors");
     let alone = run(&mut trials(Task::Push, TrialMode::ClosedLoop, 2), 2, &mut actor);
@@ -146,12 +164,15 @@ impl TrialObserver for Watching {
 
 #[test]
 fn an_idle_policy_does_not_reach_its_goals_and_is_observed() {
-    for mode in [TrialMode::OpenLoop, TrialMode::ClosedLoop] {
+    for (mode, cause) in
+        [(TrialMode::OpenLoop, "not-reached"), (TrialMode::ClosedLoop, "timed-out")]
+    {
         let mut idle = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.0);
         let mut watching = Watching::default();
-        let mut trials = trials(Task::PickAndPlace, mode, 1);
+        let config = TrialConfig { time_limit_s: 20.0, ..config(Task::PickAndPlace, mode, 1) };
+        let mut trials = TrialRunner::new(config).unwrap();
         let report = trials.run(0, &mut idle, &mut watching).unwrap();
-        assert_eq!(report.cause.map(|cause| cause.name()), Some("not-reached"), "{mode:?}");
+        assert_eq!(report.cause.map(|cause| cause.name()), Some(cause), "{mode:?}");
         assert_eq!(watching.times_s.len(), report.path.len());
         assert!(watching.times_s.is_sorted() && !watching.times_s.is_empty());
         for object in &report.objects {
@@ -230,7 +251,7 @@ fn a_policy_perceives_the_rotation_and_the_size_that_it_was_trained_with() {
 fn arms_that_are_in_each_others_way_do_not_touch_and_keep_their_steps() {
     // Both arms want to be where the other one is.
     let config =
-        TrialConfig { time_limit_s: 30.0, ..config(Task::SharedPush, TrialMode::ClosedLoop, 1) };
+        TrialConfig { time_limit_s: 60.0, ..config(Task::SharedPush, TrialMode::ClosedLoop, 1) };
     let mut ahead = |observation: &[f32], _: &[f32], action: &mut [f32]| {
         for arm in 0..2 {
             let hand = &observation[28 * arm..28 * arm + 3];

@@ -1,6 +1,7 @@
 //! The closed loop: repeats observation, action and motion.
 
 use glam::{DMat3, DVec3, EulerRot};
+use rand_chacha::ChaCha8Rng;
 use tandem_core::ArmIndex;
 use tandem_core::scene::Cuboid;
 use tandem_kinematics::{
@@ -14,15 +15,14 @@ use crate::trial::mapping::ArmObservation;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{TrialRig, tool_positions};
-use crate::trial::runner::{REST_S, TrialExecution, TrialRunner, unreachable};
+use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
+mod episodes;
 mod yielding;
 
-/// A policy is done after this many consecutive observations in which every object was within this share of the
-/// tolerance of its goal.
+/// Share of the tolerance of its goal within which an object counts as placed.
 const DONE_SHARE: f64 = 0.6;
-const DONE_OBSERVATIONS: usize = 5;
 /// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
 const STILL_M: f64 = 5e-4;
 const STILL_OPENING: f64 = 0.005;
@@ -91,54 +91,15 @@ struct LoopState {
     carries: bool,
     /// By how much each hand is to withdraw from what it presses on, own frames, metres.
     withdraw: Option<Vec<DVec3>>,
+    /// The arms that have placed their objects and stay out of the other arm's way.
+    parked: Vec<bool>,
+    /// The generator of the noise in the actions, after the first episode.
+    noise: Option<ChaCha8Rng>,
     /// The waypoints of the tools so far.
     waypoints: Vec<Waypoint>,
 }
 
 impl TrialRunner {
-    /// Runs the closed loop until the policy is done, the episode ends or a step fails.
-    pub(super) fn closed_loop(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        at: &[Joints],
-        policy: &mut dyn ActionSource,
-    ) -> TrialExecution {
-        let mut execution = TrialExecution {
-            ended: Ok(()),
-            n_steps: 0,
-            n_shortened: 0,
-            rehearsed_m: None,
-            timed_out: false,
-            n_in_success: 0,
-            waypoints: Vec::new(),
-        };
-        let mut state = LoopState::new(start, at);
-        let time_limit_s = self.config.time_limit_s / self.config.speed;
-        // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
-        while execution.n_steps - execution.n_shortened < self.task.episode_steps()
-            && state.n_done < DONE_OBSERVATIONS
-        {
-            if rig.now_s() > time_limit_s {
-                execution.timed_out = true;
-                break;
-            }
-            execution.n_steps += 1;
-            match self.step(rig, start, &mut state, policy) {
-                Ok(whole) => execution.n_shortened += usize::from(!whole),
-                Err(cause) => {
-                    execution.ended = Err(cause);
-                    break;
-                }
-            }
-        }
-        execution.ended = execution.ended.and_then(|()| rig.wait(REST_S));
-        state.count_success(self.is_success(rig, start));
-        execution.n_in_success = state.n_in_success;
-        execution.waypoints = state.waypoints;
-        execution
-    }
-
     /// Carries out one step. Returns whether the arms carried out the policy's whole action.
     fn step(
         &self,
@@ -180,6 +141,7 @@ impl TrialRunner {
         }
         let mut action = vec![0.0; layout.n_action()];
         policy.act(&observation, &goal, &mut action);
+        state.explore(&mut action);
         let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
@@ -191,6 +153,7 @@ impl TrialRunner {
             wanted.hands.push(hand);
             wanted.openings_m.push(opening_m);
         }
+        self.keep_parked(state, &mut wanted);
         self.move_hands(rig, state, &wanted)
     }
 
@@ -426,6 +389,8 @@ impl LoopState {
             n_in_success: 0,
             carries: false,
             withdraw: None,
+            parked: vec![false; at.len()],
+            noise: None,
             waypoints: Vec::new(),
         }
     }

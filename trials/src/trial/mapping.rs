@@ -215,6 +215,12 @@ impl Mapping {
         self.hand.reachable(hand)
     }
 
+    /// The largest opening of each side of the policy's gripper, metres.
+    #[must_use]
+    pub fn max_opening_m(&self) -> f64 {
+        self.hand.max_opening_m()
+    }
+
     /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above the
     /// objects on the table; own frame, metres.
     #[must_use]

@@ -20,6 +20,8 @@ const N_DRAWS: usize = 1000;
 /// The start and goals of a trial; own frames, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialStart {
+    /// The number of the trial.
+    pub number: u64,
     /// The end effectors, arm by arm.
     pub hands: Vec<DVec3>,
     /// The opening of each side of the grippers, metres.
@@ -132,7 +134,7 @@ impl Rehearsal {
         for _ in 0..N_DRAWS {
             let before = rng.clone();
             self.env.reset(&mut rng, WorldSettings::default());
-            let start = self.current_start();
+            let start = self.current_start(number);
             if self.has_room(&start) && is_free(&start) {
                 self.variants.reset(&before);
                 return Ok(start);
@@ -185,13 +187,14 @@ impl Rehearsal {
         self.variants.robustness(rollout, max_failed)
     }
 
-    fn current_start(&self) -> TrialStart {
+    fn current_start(&self, number: u64) -> TrialStart {
         let mut observation = vec![0.0; self.layout.n_observation()];
         self.env.observe(&mut observation);
         let grasps = self.layout.task.grasps();
         let opening_m = if grasps { self.hand().max_opening_m() } else { 0.0 };
         let (hands, objects) = (self.points(&observation, 0), self.points(&observation, 3));
         TrialStart {
+            number,
             hands,
             opening_m,
             objects: self.above_rest(objects),

@@ -17,7 +17,7 @@ const OWNER: Token = Token(1);
 const N_WARM_UP: usize = 15;
 /// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres. The
 /// envelope stops the arms at 4.
-const YIELD_NM: f64 = 2.0;
+const YIELD_NM: f64 = 1.5;
 const YIELD_INCREASE_NM: f64 = 0.5;
 /// The longest time from a stop to a reset, periods.
 const N_RESET: usize = 100;

@@ -261,7 +261,7 @@ impl TrialRunner {
     }
 
     /// Draws the start of trial `number`, at which the arms are as far apart as the check requires.
-    fn start(&mut self, number: u64) -> Result<TrialStart, TrialError> {
+    pub(super) fn start(&mut self, number: u64) -> Result<TrialStart, TrialError> {
         let Self { mapping, check, .. } = self;
         let is_free = |start: &TrialStart| {
             // An arm that cannot reach the start is reported later.

@@ -1,0 +1,234 @@
+//! Episodes of a trial in the closed loop.
+//!
+//! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
+//! with. Its actions then have noise: a policy without noise would fail in the same way again.
+
+use glam::DVec3;
+use tandem_core::rng::standard_normal;
+use tandem_core::{ArmIndex, Stream, episode_rng};
+use tandem_kinematics::Joints;
+
+use super::{DONE_SHARE, LoopState, WantedStep};
+use crate::simulated::ObjectPose;
+use crate::trial::ActionSource;
+use crate::trial::outcome::FailureCause;
+use crate::trial::rehearsal::TrialStart;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
+
+/// A policy is done after this many consecutive observations of placed objects that stay there.
+const DONE_OBSERVATIONS: usize = 5;
+/// The number of consecutive steps that the arms do not carry out in full, after which an arm retreats.
+const MAX_BLOCKED: usize = 10;
+/// Height above the table, metres, below which an object lies on it.
+const LYING_M: f64 = 0.01;
+/// Height by which a hand rises before it withdraws, metres.
+const RISE_M: f64 = 0.06;
+/// Standard deviation of the noise in each number of the actions.
+const NOISE_STD: f32 = 0.1;
+
+impl TrialRunner {
+    /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
+    /// one episode.
+    pub(in crate::trial) fn closed_loop(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        at: &[Joints],
+        policy: &mut dyn ActionSource,
+    ) -> TrialExecution {
+        let mut execution = TrialExecution {
+            ended: Ok(()),
+            n_steps: 0,
+            n_shortened: 0,
+            rehearsed_m: None,
+            timed_out: false,
+            n_in_success: 0,
+            waypoints: Vec::new(),
+        };
+        let mut state = LoopState::new(start, at);
+        execution.ended = self.episodes(rig, start, &mut state, policy, &mut execution);
+        state.count_success(self.is_success(rig, start));
+        execution.n_in_success = state.n_in_success;
+        execution.waypoints = state.waypoints;
+        execution
+    }
+
+    fn episodes(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        state: &mut LoopState,
+        policy: &mut dyn ActionSource,
+        execution: &mut TrialExecution,
+    ) -> Result<(), FailureCause> {
+        let time_limit_s = self.config.time_limit_s / self.config.speed;
+        let (mut n_in_episode, mut n_blocked) = (0, 0);
+        loop {
+            if state.n_done == DONE_OBSERVATIONS {
+                rig.wait(REST_S)?;
+                if self.task.shares_object()
+                    || !self.misplaced(&rig.observe_objects()?, start).any(|misplaced| misplaced)
+                {
+                    return Ok(());
+                }
+                state.n_done = 0;
+            }
+            execution.timed_out = rig.now_s() > time_limit_s;
+            let is_over = n_in_episode == self.task.episode_steps();
+            if execution.timed_out || is_over && self.task.shares_object() {
+                return rig.wait(REST_S);
+            }
+            if is_over {
+                self.start_next_episode(rig, start, state)?;
+                n_in_episode = 0;
+            }
+            execution.n_steps += 1;
+            // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
+            if self.step(rig, start, state, policy)? {
+                n_in_episode += 1;
+                n_blocked = 0;
+            } else {
+                execution.n_shortened += 1;
+                n_blocked += 1;
+            }
+            if n_blocked == MAX_BLOCKED && !self.task.shares_object() {
+                n_blocked = 0;
+                let parks = self.parking(rig, start, state)?;
+                if parks.contains(&true) {
+                    self.retreat(rig, state, &parks)?;
+                    state.parked = parks;
+                } else {
+                    self.start_next_episode(rig, start, state)?;
+                    n_in_episode = 0;
+                }
+            }
+        }
+    }
+
+    /// Withdraws the arms whose objects are not at their goals.
+    fn start_next_episode(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        state: &mut LoopState,
+    ) -> Result<(), FailureCause> {
+        let misplaced: Vec<bool> = self.misplaced(&rig.observe_objects()?, start).collect();
+        self.retreat(rig, state, &misplaced)?;
+        state.parked.fill(false);
+        state.before = None;
+        let seed = self.config.seed;
+        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
+        Ok(())
+    }
+
+    /// Returns the arms that are not parked and whose objects lie at their goals on the table.
+    fn parking(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        state: &LoopState,
+    ) -> Result<Vec<bool>, FailureCause> {
+        let objects = rig.observe_objects()?;
+        let lies = |(arm, object): (usize, &ObjectPose)| {
+            let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
+            height_m - self.config.trained_half_m < LYING_M
+        };
+        let lying: Vec<bool> = objects.iter().enumerate().map(lies).collect();
+        let placed = self.misplaced(&objects, start).map(|misplaced| !misplaced);
+        let parks = placed.zip(lying).zip(&state.parked);
+        Ok(parks.map(|((placed, lies), parked)| placed && lies && !parked).collect())
+    }
+
+    /// Opens the grippers of the `retreating` arms, raises their hands and withdraws them toward their bases, as far as
+    /// the check allows.
+    fn retreat(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+        retreating: &[bool],
+    ) -> Result<(), FailureCause> {
+        let blocks = self.observed_blocks(&rig.observe_objects()?, None);
+        let grasps = self.config.layout.task.grasps();
+        let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
+        let raised = |hand: DVec3| self.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
+        let withdrawn = |hand: DVec3| self.mapping.withdrawn_hand(hand);
+        let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
+        for way in ways {
+            let mut hands = self.hands(state);
+            let mut openings_m = state.openings_m.clone();
+            for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
+                hands[arm] = way(hands[arm]);
+                openings_m[arm] = open_m;
+            }
+            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
+            self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
+        }
+        state.velocities.fill(DVec3::ZERO);
+        Ok(())
+    }
+
+    /// Replaces what the policy wants of parked arms: they stay where they are.
+    pub(super) fn keep_parked(&self, state: &mut LoopState, wanted: &mut WantedStep<'_>) {
+        let hands = self.hands(state);
+        for arm in (0..hands.len()).filter(|arm| state.parked[*arm]) {
+            wanted.hands[arm] = hands[arm];
+            wanted.openings_m[arm] = state.openings_m[arm];
+            state.velocities[arm] = DVec3::ZERO;
+        }
+    }
+
+    /// Returns for each arm whether its object is away from its goal.
+    fn misplaced(&self, objects: &[ObjectPose], start: &TrialStart) -> impl Iterator<Item = bool> {
+        let near_m = DONE_SHARE * self.tolerance_m();
+        objects.iter().zip(&start.goals).enumerate().map(move |(arm, (object, goal))| {
+            self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal) > near_m
+        })
+    }
+}
+
+impl LoopState {
+    /// Adds noise to the actions of episodes after the first one.
+    pub(super) fn explore(&mut self, action: &mut [f32]) {
+        let Some(noise) = &mut self.noise else { return };
+        for number in action {
+            *number = (*number + NOISE_STD * standard_normal(noise)).clamp(-1.0, 1.0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Layout, Task};
+
+    use super::*;
+    use crate::simulated::{Block, SimulatedConfig};
+    use crate::trial::{TrialConfig, TrialMode};
+
+    #[test]
+    fn parked_arms_stay_whatever_the_policy_wants() {
+        let config = TrialConfig {
+            layout: Layout::new(Task::SharedPickAndPlace, 2),
+            mode: TrialMode::ClosedLoop,
+            block: Block::small([0.0; 2]),
+            trained_half_m: 0.028,
+            n_rehearsals: 1,
+            seed: 1,
+            speed: 1.0,
+            simulated: SimulatedConfig::default(),
+            time_limit_s: 120.0,
+        };
+        let mut runner = TrialRunner::new(config).unwrap();
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        state.parked[1] = true;
+        let hands = runner.hands(&state);
+        let moved: Vec<DVec3> = hands.iter().map(|hand| *hand + DVec3::X * 0.05).collect();
+        let mut wanted =
+            WantedStep { hands: moved.clone(), openings_m: vec![0.01; 2], blocks: &[] };
+        runner.keep_parked(&mut state, &mut wanted);
+        assert_eq!(wanted.hands, [moved[0], hands[1]]);
+        assert_eq!(wanted.openings_m, [0.01, start.opening_m]);
+    }
+}
