@@ -1,4 +1,4 @@
-//! The closed loop: repeats observation, action and motion.
+//! The steps of the closed loop: each observes, asks the policy and moves the arms. [`episodes`] repeats them.
 
 use glam::{DMat3, DVec3, EulerRot};
 use rand_chacha::ChaCha8Rng;
