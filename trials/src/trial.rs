@@ -34,6 +34,7 @@ pub mod rehearsal;
 mod block_avoidance;
 mod closed_loop;
 mod coordination;
+mod noise;
 mod open_loop;
 mod rig;
 mod robustness;
@@ -213,4 +214,19 @@ pub enum TrialError {
     /// The executor refuses to reset the arms.
     #[error("the arms were not reset")]
     Reset(#[from] tandem_bridge::executor::ResetError),
+}
+
+#[cfg(test)]
+pub(crate) fn test_config(task: tandem_core::Task, mode: TrialMode, seed: u64) -> TrialConfig {
+    TrialConfig {
+        layout: Layout::new(task, 2),
+        mode,
+        block: Block::small([0.0; 2]),
+        trained_half_m: 0.028,
+        n_rehearsals: 1,
+        seed,
+        speed: 1.0,
+        simulated: SimulatedConfig::default(),
+        time_limit_s: 120.0,
+    }
 }

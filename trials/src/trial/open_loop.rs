@@ -1,10 +1,11 @@
 //! Motions that are executed without observing the objects.
 
 use glam::DVec3;
-use tandem_core::ArmIndex;
+use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{ArmWaypoint, Joints, Motion, Reason, Refusal, Waypoint};
 
 use crate::trial::coordination::coordinated;
+use crate::trial::noise::add_noise;
 use crate::trial::outcome::{FailureCause, MotionRefusal};
 use crate::trial::rehearsal::{Rollout, TrialStart};
 use crate::trial::rig::TrialRig;
@@ -12,8 +13,6 @@ use crate::trial::robustness::Robustness;
 use crate::trial::runner::{REST_S, STEP_GAP_M, TrialExecution, TrialRunner};
 use crate::trial::{ActionSource, TrialError};
 
-/// Standard deviation of the noise in each number of the actions of all rehearsals but the first.
-const NOISE_STD: f32 = 0.1;
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
 /// Height by which a hand that withdraws first rises, metres.
@@ -34,20 +33,22 @@ impl TrialRunner {
     /// Plans the most robust of the configured number of episodes in the training world. The actions of all but the first
     /// one have noise.
     pub(super) fn rehearse(
-        &mut self,
+        &self,
         start: &TrialStart,
         at: &[Joints],
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let rollout = self.rehearsal.play(policy, 0.0)?;
+        let rollout = self.rehearsal.play(policy)?;
         let first = self.planned(&rollout, start, at);
-        // The variants do not predict how an object that two hands hold behaves.
-        if self.task.shares_object() || self.config.n_rehearsals == 1 {
-            return Ok(first);
-        }
+        let Some(variants) = self.rehearsal.variants() else { return Ok(first) };
+        let mut noise = episode_rng(self.config.seed, start.number, Stream::Exploration);
+        let mut noisy = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
+            policy.act(observation, goal, action);
+            add_noise(&mut noise, action);
+        };
         let mut best: Option<(Robustness, PlannedMotion)> = None;
         if first.motion.is_ok() {
-            let robustness = self.rehearsal.robustness(&rollout, usize::MAX)?;
+            let robustness = variants.robustness(&rollout, usize::MAX)?;
             best = robustness.map(|robustness| (robustness, first));
         }
         for _ in 1..self.config.n_rehearsals {
@@ -55,8 +56,8 @@ impl TrialRunner {
             if max_failed == 0 {
                 break;
             }
-            let rollout = self.rehearsal.play(policy, NOISE_STD)?;
-            let Some(robustness) = self.rehearsal.robustness(&rollout, max_failed)? else {
+            let rollout = self.rehearsal.play(&mut noisy)?;
+            let Some(robustness) = variants.robustness(&rollout, max_failed)? else {
                 continue;
             };
             if best.as_ref().is_some_and(|(most, _)| robustness <= *most) {
@@ -206,25 +207,13 @@ impl TrialRunner {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::{Layout, Task};
+    use tandem_core::Task;
 
     use super::*;
-    use crate::simulated::{Block, SimulatedConfig};
-    use crate::trial::{TrialConfig, TrialMode};
+    use crate::trial::{TrialMode, test_config};
 
     fn runner(task: Task) -> TrialRunner {
-        let config = TrialConfig {
-            layout: Layout::new(task, 2),
-            mode: TrialMode::OpenLoop,
-            block: Block::small([0.0; 2]),
-            trained_half_m: 0.028,
-            n_rehearsals: 1,
-            seed: 1,
-            speed: 1.0,
-            simulated: SimulatedConfig::default(),
-            time_limit_s: 120.0,
-        };
-        TrialRunner::new(config).unwrap()
+        TrialRunner::new(test_config(task, TrialMode::OpenLoop, 1)).unwrap()
     }
 
     #[test]

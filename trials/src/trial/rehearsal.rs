@@ -1,13 +1,11 @@
 //! The start and goals of a trial, and the policy's episode in the training world.
 
 use glam::DVec3;
-use rand_chacha::ChaCha8Rng;
-use tandem_core::rng::standard_normal;
 use tandem_core::{ArmIndex, Contacts, Layout, Stream, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::simulated::{Block, SharedObject};
-use crate::trial::robustness::{Robustness, Variants};
+use crate::trial::robustness::Variants;
 use crate::trial::shared_object::shared_object;
 use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
@@ -65,9 +63,8 @@ pub struct Rollout {
 /// The training world with blocks of the trial's size, or with its shared object.
 pub struct Rehearsal {
     env: Env,
-    variants: Variants,
-    /// The generator of the noise in rehearsals after the first one.
-    noise: ChaCha8Rng,
+    config: WorldConfig,
+    variants: Option<Variants>,
     layout: Layout,
     /// The number of control steps of an episode.
     n_steps: usize,
@@ -88,11 +85,10 @@ impl Rehearsal {
             object_mass_kg: block.mass_kg,
             ..WorldConfig::default()
         };
-        let env = Env::new(layout, &world)?;
         let mut rehearsal = Self {
-            variants: Variants::new(layout, &world, env.description().hand.action_m)?,
-            noise: episode_rng(0, 0, Stream::Exploration),
-            env,
+            env: Env::new(layout, &world)?,
+            config: world,
+            variants: None,
             layout,
             n_steps: TaskSpec::from(layout).episode_steps(),
             half_m: f64::from(block.half_m),
@@ -130,28 +126,25 @@ impl Rehearsal {
         is_free: impl Fn(&TrialStart) -> bool,
     ) -> Result<TrialStart, TrialError> {
         let mut rng = episode_rng(seed, number, Stream::Reset);
-        self.noise = episode_rng(seed, number, Stream::Exploration);
         for _ in 0..N_DRAWS {
             let before = rng.clone();
             self.env.reset(&mut rng, WorldSettings::default());
             let start = self.current_start(number);
             if self.has_room(&start) && is_free(&start) {
-                self.variants.reset(&before);
+                if let Some(variants) = &mut self.variants {
+                    variants.reset(&before);
+                }
                 return Ok(start);
             }
         }
         Err(TrialError::NoRoom { half_m: self.half_m })
     }
 
-    /// Plays the policy's episode from the start that was drawn last, with noise of `noise_std` in its actions.
+    /// Plays the policy's episode from the start that was drawn last.
     ///
     /// # Errors
     /// Returns an error if the simulation fails.
-    pub fn play(
-        &mut self,
-        policy: &mut dyn ActionSource,
-        noise_std: f32,
-    ) -> Result<Rollout, SimError> {
+    pub fn play(&self, policy: &mut dyn ActionSource) -> Result<Rollout, SimError> {
         let mut env = self.env.clone();
         let mut observation = vec![0.0; self.layout.n_observation()];
         let goal = env.goal().to_vec();
@@ -161,12 +154,6 @@ impl Rehearsal {
             env.observe(&mut observation);
             let mut action = vec![0.0; self.layout.n_action()];
             policy.act(&observation, &goal, &mut action);
-            if noise_std > 0.0 {
-                for number in &mut action {
-                    let noise = noise_std * standard_normal(&mut self.noise);
-                    *number = (*number + noise).clamp(-1.0, 1.0);
-                }
-            }
             let openings_m = self.openings_m(&observation);
             contacts = contacts | env.step(&action)?;
             env.observe(&mut observation);
@@ -177,14 +164,19 @@ impl Rehearsal {
         Ok(Rollout { steps, goal_distances_m, contacts })
     }
 
-    /// Returns the robustness of a rollout from the start that was drawn last, or `None` if it fails in more than
-    /// `max_failed` variants of the training world.
-    pub(super) fn robustness(
-        &self,
-        rollout: &Rollout,
-        max_failed: usize,
-    ) -> Result<Option<Robustness>, SimError> {
-        self.variants.robustness(rollout, max_failed)
+    /// Prepares variants of the world for the starts that are drawn from now on. An object that all arms share has none:
+    /// they do not predict how an object that two hands hold behaves.
+    pub(super) fn add_variants(&mut self) -> Result<(), SimError> {
+        if !TaskSpec::from(self.layout).shares_object() {
+            let action_m = self.env.description().hand.action_m;
+            self.variants = Some(Variants::new(self.layout, &self.config, action_m)?);
+        }
+        Ok(())
+    }
+
+    /// Returns the variants of the world, at the start that was drawn last.
+    pub(super) fn variants(&self) -> Option<&Variants> {
+        self.variants.as_ref()
     }
 
     fn current_start(&self, number: u64) -> TrialStart {

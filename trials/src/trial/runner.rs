@@ -72,7 +72,10 @@ impl TrialRunner {
         let mut cell = mico_cell_of(config.layout.task.world());
         cell.arms.truncate(config.layout.n_arms);
         let trained_half_m = config.trained_half_m;
-        let rehearsal = Rehearsal::new(config.layout, &config.block, trained_half_m)?;
+        let mut rehearsal = Rehearsal::new(config.layout, &config.block, trained_half_m)?;
+        if config.mode == TrialMode::OpenLoop && config.n_rehearsals > 1 {
+            rehearsal.add_variants()?;
+        }
         let half_m = rehearsal.shared_object().map(|shared| shared.grasped_half_m());
         let block = Block { half_m: half_m.unwrap_or(config.block.half_m), ..config.block };
         let config = TrialConfig { block, ..config };
@@ -349,24 +352,14 @@ fn twin_of(simulated: &SimulatedConfig) -> SimulatedConfig {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::{Layout, Task};
+    use tandem_core::Task;
 
     use super::*;
-    use crate::trial::mapping::TRAINED_HALF_M;
+    use crate::trial::test_config;
 
     #[test]
     fn arms_start_where_the_executor_lets_them_move() {
-        let config = TrialConfig {
-            layout: Layout::new(Task::SharedPickAndPlace, 2),
-            mode: TrialMode::ClosedLoop,
-            block: Block::small([0.0; 2]),
-            trained_half_m: TRAINED_HALF_M,
-            n_rehearsals: 1,
-            seed: 2,
-            speed: 1.0,
-            simulated: SimulatedConfig::default(),
-            time_limit_s: 120.0,
-        };
+        let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 2);
         let least_rad = tandem_bridge::executor::Settings::default().range_margin_rad;
         let mut runner = TrialRunner::new(config).unwrap();
         for number in 0..50 {

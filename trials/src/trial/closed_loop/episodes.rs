@@ -4,13 +4,13 @@
 //! with. Its actions then have noise: a policy without noise would fail in the same way again.
 
 use glam::DVec3;
-use tandem_core::rng::standard_normal;
 use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::Joints;
 
 use super::{DONE_SHARE, LoopState, WantedStep};
 use crate::simulated::ObjectPose;
 use crate::trial::ActionSource;
+use crate::trial::noise::add_noise;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::TrialRig;
@@ -24,8 +24,6 @@ const MAX_BLOCKED: usize = 10;
 const LYING_M: f64 = 0.01;
 /// Height by which a hand rises before it withdraws, metres.
 const RISE_M: f64 = 0.06;
-/// Standard deviation of the noise in each number of the actions.
-const NOISE_STD: f32 = 0.1;
 
 impl TrialRunner {
     /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
@@ -190,34 +188,22 @@ impl TrialRunner {
 impl LoopState {
     /// Adds noise to the actions of episodes after the first one.
     pub(super) fn explore(&mut self, action: &mut [f32]) {
-        let Some(noise) = &mut self.noise else { return };
-        for number in action {
-            *number = (*number + NOISE_STD * standard_normal(noise)).clamp(-1.0, 1.0);
+        if let Some(noise) = &mut self.noise {
+            add_noise(noise, action);
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::{Layout, Task};
+    use tandem_core::Task;
 
     use super::*;
-    use crate::simulated::{Block, SimulatedConfig};
-    use crate::trial::{TrialConfig, TrialMode};
+    use crate::trial::{TrialMode, test_config};
 
     #[test]
     fn parked_arms_stay_whatever_the_policy_wants() {
-        let config = TrialConfig {
-            layout: Layout::new(Task::SharedPickAndPlace, 2),
-            mode: TrialMode::ClosedLoop,
-            block: Block::small([0.0; 2]),
-            trained_half_m: 0.028,
-            n_rehearsals: 1,
-            seed: 1,
-            speed: 1.0,
-            simulated: SimulatedConfig::default(),
-            time_limit_s: 120.0,
-        };
+        let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
         let at = runner.mapping.cell().ready(0.2).unwrap();
