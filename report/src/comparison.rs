@@ -1,12 +1,16 @@
 //! Comparison of runs: the tables of a report, in one section for each task and number of arms.
 
 use crate::group::{MILESTONES, SeedGroup, TaskSetup, group_by_settings};
-use crate::paper::{PaperMeasures, TABLE_2};
+use crate::measures::CostOf;
+use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::table::{NONE, Table, optional, share_spread, short_number, spread, wrapped};
+use crate::table::{NONE, Table, share_spread, short_number, spread, wrapped};
 use crate::test_evaluation::TestEvaluation;
 
+mod paper_table;
 mod summary;
+
+pub use paper_table::paper_table;
 
 /// Runs and baselines, by task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -119,7 +123,11 @@ impl Section {
     pub fn tables(&self) -> Vec<Table> {
         let mut tables = vec![self.success()];
         if !self.groups.is_empty() {
-            tables.extend([self.cost(), self.measures()]);
+            tables.push(self.cost(Quantity::Success));
+            if self.has_success_without_contact() {
+                tables.push(self.cost(Quantity::SuccessWithoutContact));
+            }
+            tables.push(self.measures());
         }
         tables
     }
@@ -166,11 +174,15 @@ impl Section {
         table
     }
 
-    /// Returns the environment steps, minutes and advice that the runs needed to reach the [`MILESTONES`].
-    fn cost(&self) -> Table {
-        let title = format!("{}: cost of a success in an evaluation", self.setup.title());
+    /// Returns whether all runs have evaluated the success without contact between the arms.
+    pub(crate) fn has_success_without_contact(&self) -> bool {
+        self.groups.iter().all(SeedGroup::has_success_without_contact)
+    }
+
+    /// Returns what the runs needed to reach the [`MILESTONES`] of `measure`.
+    fn cost(&self, measure: Quantity) -> Table {
         let mut table = Table::new(
-            title,
+            cost_title(self, measure),
             &[
                 "strategy",
                 "env steps to 50 %",
@@ -179,18 +191,31 @@ impl Section {
                 "minutes to 50 %",
                 "90 %",
                 "95 %",
-                "advice spent",
+                "updates to 90 %",
+                "advice to 90 %",
+                "queries to 90 %",
+                "advice in all",
+                "queries",
             ],
         );
         for group in &self.groups {
+            let at = |success, value: CostOf| group.at_milestone((measure, success), value);
+            let at_90 = |value| spread(&at(0.9, value), short_number);
             let mut row = vec![group.label.clone()];
             row.extend(MILESTONES.map(|success| {
-                spread(&group.at_milestone(success, |row| row.env_steps as f64), short_number)
+                spread(&at(success, |row| Some(row.env_steps as f64)), short_number)
             }));
-            row.extend(MILESTONES.map(|success| {
-                spread(&group.at_milestone(success, |row| row.wall_s / 60.0), minutes)
-            }));
-            row.push(spread(&group.spread(advice_spent), short_number));
+            row.extend(
+                MILESTONES
+                    .map(|success| spread(&at(success, |row| Some(row.wall_s / 60.0)), minutes)),
+            );
+            row.extend([
+                at_90(|row| Some(row.updates as f64)),
+                at_90(|row| Some(row.advice_spent as f64)),
+                at_90(|row| Some(row.advice_queries? as f64)),
+                spread(&group.spread(advice_spent), short_number),
+                spread(&group.spread(advice_queries), short_number),
+            ]);
             table.rows.push(row);
         }
         table
@@ -242,6 +267,19 @@ fn env_steps(run: &Run) -> Option<f64> {
     Some(run.last()?.env_steps as f64)
 }
 
+fn cost_title(section: &Section, measure: Quantity) -> String {
+    let of_what = match measure {
+        Quantity::SuccessWithoutContact => "success without contact",
+        _ => "success",
+    };
+    format!("{}: cost of a {of_what} in an evaluation", section.setup.title())
+}
+
+/// Returns the number of steps on which the teacher was asked.
+fn advice_queries(run: &Run) -> Option<f64> {
+    Some(run.last()?.advice_queries? as f64)
+}
+
 fn advice_spent(run: &Run) -> Option<f64> {
     Some(run.last()?.advice_spent as f64)
 }
@@ -286,45 +324,6 @@ fn baseline_row(Baseline { label, test }: &Baseline) -> Vec<String> {
     ]
 }
 
-/// Returns the paper's Table 2 with the paper's values, by the names of Tandem's strategies.
-#[must_use]
-pub fn paper_table() -> Table {
-    let header = [
-        "strategy",
-        "in the paper",
-        "push: IE",
-        "RT",
-        "MSR",
-        "ELR",
-        "pick and place: IE",
-        "RT",
-        "MSR",
-        "ELR",
-    ];
-    let mut table = Table::new("the paper's Table 2".to_owned(), &header);
-    table.rows.extend(TABLE_2.iter().map(|row| {
-        let threshold = row.threshold.map(|threshold| format!(":{threshold}"));
-        let mut cells =
-            vec![format!("{}{}", row.strategy, threshold.unwrap_or_default()), row.name.to_owned()];
-        cells.extend(paper_cells(&row.push));
-        cells.extend(paper_cells(&row.pick_and_place));
-        cells
-    }));
-    table
-}
-
-fn paper_cells(measures: &PaperMeasures) -> [String; 4] {
-    let whole = |epochs: f64| format!("{epochs:.0}");
-    let has_learned = measures.inspired_epoch.is_some();
-    let rate = Some(measures.learning_rate).filter(|_| has_learned);
-    [
-        optional(measures.inspired_epoch, whole),
-        optional(measures.rising_epochs, whole),
-        four_digits(measures.max_success),
-        optional(rate, four_digits),
-    ]
-}
-
 fn range(low: f64, high: f64) -> String {
     format!("{low:.3}–{high:.3}")
 }
@@ -351,6 +350,7 @@ mod tests {
     use tandem_telemetry::{ContactMetrics, MetricsRow};
 
     use super::*;
+    use crate::plots::comparison_plots;
 
     fn run(task: &str, strategy: &str, seed: u64, successes: &[f64]) -> Run {
         let row = |(idx, success): (u64, &f64)| MetricsRow {
@@ -360,6 +360,7 @@ mod tests {
             success: *success,
             n_episodes: 240,
             advice_spent: 4000 * idx,
+            updates: 10_000 * idx,
             ..MetricsRow::default()
         };
         Run {
@@ -409,8 +410,9 @@ mod tests {
         );
         assert_eq!(row(&section.measures(), "none"), "1; –; –; 0.0000; –");
         assert_eq!(
-            row(&section.cost(), "mc-q:0.1"),
-            "50k (40k–60k); 70k (60k–80k); 100k, 1 of 2; 3.8 (3.0–4.5); 5.2 (4.5–6.0); 7.5, 1 of 2; 20k (20k–20k)"
+            row(&section.cost(Quantity::Success), "mc-q:0.1"),
+            "50k (40k–60k); 70k (60k–80k); 100k, 1 of 2; 3.8 (3.0–4.5); 5.2 (4.5–6.0); 7.5, 1 of 2; 35k (30k–40k); \
+             14k (12k–16k); –; 20k (20k–20k); –"
         );
         let text = comparison.text();
         assert_eq!(
@@ -420,6 +422,28 @@ mod tests {
         );
         assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
         assert!(!text.contains("No evaluation yet"));
+    }
+
+    #[test]
+    fn a_success_without_contact_has_its_own_cost_and_curve() {
+        let mut touching = run("shared-push", "mc-q:0.1", 1, &[0.2, 0.9, 0.95]);
+        for (row, share) in touching.rows.iter_mut().zip([0.1, 0.6, 0.92]) {
+            row.contacts.success_without_contact = Some(share);
+            row.advice_queries = Some(row.advice_spent * 2);
+        }
+        let comparison = Comparison::of(vec![touching], Vec::new());
+        let section = &comparison.sections[0];
+        let row = |table: &Table| table.rows[0][1..].join("; ");
+        assert_eq!(
+            row(&section.cost(Quantity::SuccessWithoutContact)),
+            "40k; 60k; –; 3.0; 4.5; –; 30k; 12k; 24k; 12k; 24k"
+        );
+        let text = comparison.text();
+        assert!(text.contains("cost of a success without contact in an evaluation"), "{text}");
+        let plots = comparison_plots(&comparison).expect("drawn");
+        let names: Vec<&str> = plots.all().map(|plot| plot.file_name.as_str()).collect();
+        let name = "shared-push-2-success-without-contact-environment-steps-strategies.svg";
+        assert_eq!(names.iter().position(|other| *other == name), Some(1), "{names:?}");
     }
 
     #[test]

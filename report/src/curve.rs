@@ -8,6 +8,7 @@ use plotters::prelude::{
 use tandem_telemetry::MetricsRow;
 
 use crate::error::Error;
+use crate::quantity::Quantity;
 use crate::table::short_number;
 use layout::{
     LEGEND_LEFT_PX, LEGEND_LINE_PX, LEGEND_PX, LegendEntry, legend_entries, n_legend_lines, wrapped,
@@ -97,62 +98,6 @@ impl Axis {
     }
 }
 
-/// The metric that a curve shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quantity {
-    /// Evaluation success, with its 95 % interval.
-    Success,
-    /// Evaluation success by the joint norm.
-    SuccessJoint,
-    /// Success of the training episodes.
-    TrainingSuccess,
-    /// Share of evaluation episodes in which an object was displaced.
-    Moved,
-    /// Share of evaluation episodes with a contact.
-    CollisionRate,
-    /// Share of evaluation episodes with a contact before all objects were at their goals.
-    CollisionRateBeforeSuccess,
-    /// Mean Q-value of the policy's actions.
-    MeanQ,
-    /// Units of advice spent.
-    AdviceSpent,
-}
-
-impl Quantity {
-    /// Returns the label of the vertical axis.
-    #[must_use]
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Success | Self::SuccessJoint | Self::TrainingSuccess => "success rate",
-            Self::Moved | Self::CollisionRate | Self::CollisionRateBeforeSuccess => {
-                "share of episodes"
-            }
-            Self::MeanQ => "mean Q-value",
-            Self::AdviceSpent => "units of advice",
-        }
-    }
-
-    /// Returns whether the values are shares, in [0, 1].
-    #[must_use]
-    pub const fn is_share(self) -> bool {
-        !matches!(self, Self::MeanQ | Self::AdviceSpent)
-    }
-
-    /// Returns the value of this metric in `row`.
-    pub(crate) fn of(self, row: &MetricsRow) -> f64 {
-        match self {
-            Self::Success => row.success,
-            Self::SuccessJoint => row.success_joint,
-            Self::TrainingSuccess => row.training_success,
-            Self::Moved => row.moved,
-            Self::CollisionRate => row.collision_rate,
-            Self::CollisionRateBeforeSuccess => row.collision_rate_before_success,
-            Self::MeanQ => row.mean_q,
-            Self::AdviceSpent => row.advice_spent as f64,
-        }
-    }
-}
-
 /// A point of a curve.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurvePoint {
@@ -180,7 +125,7 @@ impl Series {
         let point = |row: &MetricsRow| CurvePoint {
             x: axis.of(row),
             y: quantity.of(row),
-            band: (quantity == Quantity::Success).then_some((row.success_low, row.success_high)),
+            band: quantity.interval(row),
         };
         let points =
             rows.iter().map(point).filter(|point| point.x.is_finite() && point.y.is_finite());

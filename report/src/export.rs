@@ -6,7 +6,8 @@ use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{Comparison, Section, success_without_contact};
 use crate::group::{MILESTONES, SeedGroup, Spread};
-use crate::measures::{LearningMeasures, first_reaching};
+use crate::measures::{CostOf, LearningMeasures, first_reaching};
+use crate::quantity::Quantity;
 use crate::run::Run;
 
 /// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
@@ -57,7 +58,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         number(measures.map(|measures| measures.max_success)),
         number(measures.and_then(|measures| measures.learning_rate)),
     ];
-    let reached = MILESTONES.map(|success| first_reaching(&run.rows, success));
+    let reached = MILESTONES.map(|success| first_reaching(&run.rows, Quantity::Success, success));
     cells.extend(reached.map(|row| count(row.map(|row| row.env_steps))));
     cells.extend(reached.map(|row| number(row.map(|row| row.wall_s / 60.0))));
     cells.push(count(last.map(|row| row.advice_spent)));
@@ -125,13 +126,7 @@ fn group_json(group: &SeedGroup) -> Value {
             "max_success": measures.max_success, "effective_learning_rate": measures.learning_rate,
         })
     });
-    let milestones = MILESTONES.map(|success| {
-        json!({
-            "success": success,
-            "env_steps": spread_json(&group.at_milestone(success, |row| row.env_steps as f64)),
-            "minutes": spread_json(&group.at_milestone(success, |row| row.wall_s / 60.0)),
-        })
-    });
+    let milestones = |measure| MILESTONES.map(|success| milestone_json(group, (measure, success)));
     json!({
         "label": group.label,
         "strategy": group.strategy,
@@ -141,7 +136,8 @@ fn group_json(group: &SeedGroup) -> Value {
         "max_success": spread_json(&group.measure(|measures| Some(measures.max_success))),
         "effective_learning_rate": spread_json(&group.measure(|measures| measures.learning_rate)),
         "paper": paper,
-        "milestones": milestones,
+        "milestones": milestones(Quantity::Success),
+        "milestones_without_contact": milestones(Quantity::SuccessWithoutContact),
         "env_steps": spread_json(&group.spread(|run| Some(run.last()?.env_steps as f64))),
         "advice_spent": spread_json(&group.spread(|run| Some(run.last()?.advice_spent as f64))),
         "advice_queries": spread_json(&group.spread(|run| Some(run.last()?.advice_queries? as f64))),
@@ -155,6 +151,19 @@ fn group_json(group: &SeedGroup) -> Value {
             let last = run.last().filter(|_| run.reports_contacts());
             last.map(|row| (row.collision_rate, row.n_episodes))
         }),
+    })
+}
+
+/// Returns what the runs of a group needed to reach a success.
+fn milestone_json(group: &SeedGroup, milestone: (Quantity, f64)) -> Value {
+    let at = |value: CostOf| spread_json(&group.at_milestone(milestone, value));
+    json!({
+        "success": milestone.1,
+        "env_steps": at(|row| Some(row.env_steps as f64)),
+        "updates": at(|row| Some(row.updates as f64)),
+        "minutes": at(|row| Some(row.wall_s / 60.0)),
+        "advice_spent": at(|row| Some(row.advice_spent as f64)),
+        "advice_queries": at(|row| Some(row.advice_queries? as f64)),
     })
 }
 

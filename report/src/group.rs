@@ -8,6 +8,7 @@ use toml::{Table, Value};
 
 use crate::measures::{LearningMeasures, first_reaching};
 use crate::paper::PaperRow;
+use crate::quantity::Quantity;
 use crate::run::Run;
 
 /// Success rates for which reports give the cost of reaching them.
@@ -255,9 +256,20 @@ impl SeedGroup {
         self.spread(|run| measure(&LearningMeasures::for_comparison(&run.rows)?))
     }
 
-    /// Returns the spread of a value of each run's first evaluation with at least `success`.
-    pub fn at_milestone(&self, success: f64, value: impl Fn(&MetricsRow) -> f64) -> Spread {
-        self.spread(|run| first_reaching(&run.rows, success).map(&value))
+    /// Returns the spread of a value of each run's first evaluation in which `measure` is at least `success`.
+    pub fn at_milestone(
+        &self,
+        (measure, success): (Quantity, f64),
+        value: impl Fn(&MetricsRow) -> Option<f64>,
+    ) -> Spread {
+        self.spread(|run| first_reaching(&run.rows, measure, success).and_then(&value))
+    }
+
+    /// Returns whether the evaluations of all runs that have any contain the success without contact.
+    pub(crate) fn has_success_without_contact(&self) -> bool {
+        let is_known = |row: &MetricsRow| Quantity::SuccessWithoutContact.of(row).is_finite();
+        let evaluated = |run: &&Run| !run.rows.is_empty();
+        self.runs.iter().filter(evaluated).all(|run| run.rows.iter().any(is_known))
     }
 
     /// Returns the spread of a share, and its 95 % interval over the episodes of all runs.
@@ -457,11 +469,11 @@ mod tests {
             run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.2, 0.5, 0.5, 0.6, 0.5]),
         ])
         .remove(0);
-        let fifty = group.at_milestone(0.5, |row| row.env_steps as f64);
+        let fifty = group.at_milestone((Quantity::Success, 0.5), |row| Some(row.env_steps as f64));
         assert_eq!(fifty, Spread { n: 2, n_runs: 2, mean: 2500.0, min: 2000.0, max: 3000.0 });
-        let ninety = group.at_milestone(0.9, |row| row.wall_s / 60.0);
+        let ninety = group.at_milestone((Quantity::Success, 0.9), |row| Some(row.wall_s / 60.0));
         assert_eq!(ninety, Spread { n: 1, n_runs: 2, mean: 3.0, min: 3.0, max: 3.0 });
-        assert_eq!(group.at_milestone(0.99, |row| row.wall_s).n, 0);
+        assert_eq!(group.at_milestone((Quantity::Success, 0.99), |row| Some(row.wall_s)).n, 0);
         let inspired = group.measure(|measures| measures.inspired_epoch);
         assert_eq!((inspired.mean, inspired.min, inspired.max), (1.5, 1.0, 2.0));
         let rate = group.measure(|measures| measures.learning_rate);

@@ -2,6 +2,8 @@
 
 use tandem_telemetry::MetricsRow;
 
+use crate::quantity::Quantity;
+
 /// Share of the maximum success that defines IE and the start of RT.
 const INSPIRED_SHARE: f64 = 0.1;
 /// Share of the maximum success that defines the end of RT, and ELR.
@@ -34,7 +36,7 @@ impl LearningMeasures {
     pub fn of(rows: &[MetricsRow]) -> Self {
         let max_success = rows.iter().map(|row| row.success).fold(0.0, f64::max);
         let epoch_reaching = |share: f64| {
-            let reached = first_reaching(rows, share * max_success);
+            let reached = first_reaching(rows, Quantity::Success, share * max_success);
             reached.filter(|_| max_success > 0.0).map(|row| row.paper_epochs)
         };
         let (inspired, risen) = (epoch_reaching(INSPIRED_SHARE), epoch_reaching(RISEN_SHARE));
@@ -67,10 +69,13 @@ impl LearningMeasures {
     }
 }
 
-/// Returns the first evaluation with a success of at least `success`.
+/// What an evaluation had cost until then, if it is known.
+pub(crate) type CostOf = fn(&MetricsRow) -> Option<f64>;
+
+/// Returns the first evaluation in which `quantity` is at least `value`.
 #[must_use]
-pub fn first_reaching(rows: &[MetricsRow], success: f64) -> Option<&MetricsRow> {
-    rows.iter().find(|row| row.success >= success - ROUNDING)
+pub fn first_reaching(rows: &[MetricsRow], quantity: Quantity, value: f64) -> Option<&MetricsRow> {
+    rows.iter().find(|row| quantity.of(row) >= value - ROUNDING)
 }
 
 #[cfg(test)]
@@ -131,11 +136,12 @@ mod tests {
     #[test]
     fn a_threshold_is_reached_by_the_first_evaluation_at_or_above_it() {
         let rows = rows(&[0.4, 228.0 / 240.0, 0.8, 1.0]);
-        let epoch = |success| first_reaching(&rows, success).map(|row| row.paper_epochs);
+        let reached = |success| first_reaching(&rows, Quantity::Success, success);
+        let epoch = |success| reached(success).map(|row| row.paper_epochs);
         assert_eq!(
             [0.0, 0.5, 0.95, 0.951, 1.0].map(epoch),
             [Some(0.0), Some(10.0), Some(10.0), Some(30.0), Some(30.0)]
         );
-        assert_eq!(first_reaching(&rows[..1], 0.5), None);
+        assert_eq!(first_reaching(&rows[..1], Quantity::Success, 0.5), None);
     }
 }

@@ -6,10 +6,11 @@ use tandem_core::Task;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{Baseline, Comparison, Section};
-use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Quantity, Series, curve_drawing};
+use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Series, curve_drawing};
 use crate::error::Error;
 use crate::group::SeedGroup;
 use crate::paper::split_strategy;
+use crate::quantity::Quantity;
 
 /// Maximum number of curves in a plot of other runs, or of learning from scratch.
 const MAX_CURVES: usize = 6;
@@ -42,8 +43,9 @@ struct Panel<'a> {
 }
 
 /// Plots of each panel: name, quantity, axis, and the number of the paper's figure for push and for pick and place.
-const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 6] = [
+const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 7] = [
     ("success", Quantity::Success, Axis::EnvSteps, None),
+    ("success without contact", Quantity::SuccessWithoutContact, Axis::EnvSteps, None),
     ("success", Quantity::Success, Axis::Updates, None),
     ("success", Quantity::Success, Axis::Minutes, None),
     ("advice spent", Quantity::AdviceSpent, Axis::EnvSteps, None),
@@ -51,7 +53,7 @@ const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 6] = [
     ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
 ];
 /// Number of [`VIEWS`] that a page shows first.
-pub(crate) const N_FIRST_VIEWS: usize = 4;
+const N_FIRST_VIEWS: usize = 5;
 
 /// The plots of a comparison.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -69,6 +71,11 @@ impl ComparisonPlots {
     }
 }
 
+/// Returns the number of a section's plots that a page shows first.
+pub(crate) fn n_first_plots(section: &Section) -> usize {
+    N_FIRST_VIEWS - usize::from(!section.has_success_without_contact())
+}
+
 /// Draws all plots of a comparison.
 ///
 /// # Errors
@@ -83,6 +90,10 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
     let mut plots = Vec::new();
     for panel in panels(&section.groups) {
         for (name, quantity, axis, paper) in VIEWS {
+            if quantity == Quantity::SuccessWithoutContact && !section.has_success_without_contact()
+            {
+                continue;
+            }
             let reference = paper.zip(panel.letter).zip(section.setup.built_in());
             let reference = reference.filter(|_| section.setup.n_arms != Some(1));
             let reference =
@@ -137,18 +148,26 @@ fn draw(
         groups.iter().map(|group| series(group, axis, quantity)).collect();
     let xs = series.iter().flat_map(|one| &one.points).map(|point| point.x);
     let x_max = xs.fold(0.0, f64::max);
-    if quantity == Quantity::Success && x_max > 0.0 {
-        series.extend(baselines.iter().map(|baseline| level(baseline, x_max)));
+    if x_max > 0.0 {
+        series.extend(baselines.iter().filter_map(|baseline| level(baseline, quantity, x_max)));
     }
     let Drawing { wide, narrow } = curve_drawing(&series, CurveOptions::of(title, quantity, axis))?;
     let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
     Ok(Plot { file_name, title: title.to_owned(), svg: wide, narrow_svg: narrow })
 }
 
-/// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals.
-fn level(Baseline { label, test }: &Baseline, x_max: f64) -> Series {
-    let point = |x| CurvePoint { x, y: test.success, band: Some(test.interval) };
-    Series { name: label.clone(), points: vec![point(0.0), point(x_max)] }
+/// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals, if `quantity`
+/// is a success.
+fn level(Baseline { label, test }: &Baseline, quantity: Quantity, x_max: f64) -> Option<Series> {
+    let (success, interval) = match quantity {
+        Quantity::Success => (test.success, test.interval),
+        Quantity::SuccessWithoutContact => {
+            test.contacts.success().map(|[success, low, high]| (success, (low, high)))?
+        }
+        _ => return None,
+    };
+    let point = |x| CurvePoint { x, y: success, band: Some(interval) };
+    Some(Series { name: label.clone(), points: vec![point(0.0), point(x_max)] })
 }
 
 /// Returns a group's curve.
@@ -374,7 +393,8 @@ mod tests {
             contacts: ContactMetrics::default(),
         };
         let baseline = Baseline { label: "composed teachers".to_owned(), test };
-        let line = level(&baseline, 10.0);
+        let line = level(&baseline, Quantity::Success, 10.0).unwrap();
+        assert_eq!(level(&baseline, Quantity::SuccessWithoutContact, 10.0), None);
         assert_eq!(
             line.points.iter().map(|point| (point.x, point.y)).collect::<Vec<_>>(),
             [(0.0, 0.95), (10.0, 0.95)]

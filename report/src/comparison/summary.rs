@@ -1,10 +1,12 @@
 //! The tables of means, which fit into a terminal.
 
 use super::{
-    Baseline, Section, advice_spent, best_success, env_steps, epochs, four_digits, minutes, range,
-    success_without_contact, test_success, three_digits,
+    Baseline, Section, advice_spent, best_success, cost_title, env_steps, epochs, four_digits,
+    minutes, range, success_without_contact, test_success, three_digits,
 };
 use crate::group::MILESTONES;
+use crate::measures::CostOf;
+use crate::quantity::Quantity;
 use crate::table::{NONE, Table, mean, optional, short_number};
 
 impl Section {
@@ -39,17 +41,24 @@ impl Section {
         table
     }
 
-    /// Returns the mean cost of a success.
+    /// Returns the mean cost of a success, or of one without contact if all runs have evaluated that.
     pub(super) fn cost_summary(&self) -> Table {
-        let title = format!("{}: cost of a success in an evaluation", self.setup.title());
+        let measure = match self.has_success_without_contact() {
+            true => Quantity::SuccessWithoutContact,
+            false => Quantity::Success,
+        };
+        let title = cost_title(self, measure);
         let header =
             ["strategy", "steps to 50 %", "90 %", "95 %", "min to 90 %", "advice", "steps"];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
-            let steps = |success| group.at_milestone(success, |row| row.env_steps as f64);
+            let at = |success, value: CostOf| group.at_milestone((measure, success), value);
             let mut row = vec![group.label.clone()];
-            row.extend(MILESTONES.map(|success| mean(&steps(success), rounded)));
-            row.push(mean(&group.at_milestone(0.9, |row| row.wall_s / 60.0), minutes));
+            row.extend(
+                MILESTONES
+                    .map(|success| mean(&at(success, |row| Some(row.env_steps as f64)), rounded)),
+            );
+            row.push(mean(&at(0.9, |row| Some(row.wall_s / 60.0)), minutes));
             row.push(mean(&group.spread(advice_spent), rounded));
             row.push(mean(&group.spread(env_steps), rounded));
             table.rows.push(row);

@@ -3,7 +3,7 @@
 use crate::comparison::{Comparison, LEGEND, Section, paper_table};
 use crate::html::{details, escaped, film_strip, plot_grid, titled_table};
 use crate::paper;
-use crate::plots::{ComparisonPlots, N_FIRST_VIEWS, Plot};
+use crate::plots::{ComparisonPlots, Plot, n_first_plots};
 
 /// Explains the values of the tables.
 const NOTES: &str = "Values over several runs are the mean, with the smallest and the largest below it where a table has room, \
@@ -37,7 +37,7 @@ pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
 }
 
 fn section_body(section: &Section, plots: &[Plot]) -> String {
-    let (first, further) = plots.split_at(plots.len().min(N_FIRST_VIEWS));
+    let (first, further) = plots.split_at(plots.len().min(n_first_plots(section)));
     let mut body = format!("<h2>{}</h2>", escaped(&section.setup.title()));
     if !first.is_empty() {
         body.push_str(&plot_grid(first));

@@ -5,9 +5,10 @@ use tandem_core::task::Norm;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::FilmStrip;
-use crate::curve::{Axis, CurveOptions, Drawing, Quantity, Series, curve_drawing};
+use crate::curve::{Axis, CurveOptions, Drawing, Series, curve_drawing};
 use crate::error::Error;
 use crate::html::{details, drawing_grid, escaped, film_strip, table};
+use crate::quantity::Quantity;
 use crate::run::Run;
 use crate::table::{NONE, duration, interval, number, optional, share, thousands};
 
