@@ -1,8 +1,9 @@
 //! Rehearsed motions that also succeed where the arms' world differs from the training world.
 //!
 //! A blind motion cannot react to the differences between the world of its rehearsal and the one of its execution. Each
-//! variant of the training world differs in friction and mass, and its hands are displaced by a few millimetres. Of
-//! several rehearsals, the one is executed whose actions reach the goals in the most variants.
+//! variant of the training world differs in friction and mass, and its hands are displaced by a few millimetres. In more
+//! than half of them the pads that grasp are of rubber. Of several rehearsals, the one is executed whose actions reach the
+//! goals in the most variants.
 
 use std::cmp::Ordering;
 
@@ -12,17 +13,19 @@ use tandem_sim::{Env, Friction, SimError, WorldConfig};
 
 use crate::trial::rehearsal::{Rollout, goal_distances_m};
 
+/// Factor from the friction of the pads that grasp in the training world, 0.45, to that of rubber pads, 0.8.
+const RUBBER: f32 = 1.8;
 /// The differences of each variant.
 const DIFFERENCES: [Difference; 9] = [
-    Difference { friction: 1.0, mass: 1.0, offset_m: [0.0, 0.0] },
-    Difference { friction: 0.8, mass: 1.0, offset_m: [0.003, 0.0] },
-    Difference { friction: 1.2, mass: 1.0, offset_m: [-0.003, 0.0] },
-    Difference { friction: 0.8, mass: 1.0, offset_m: [0.0, 0.003] },
-    Difference { friction: 1.2, mass: 1.0, offset_m: [0.0, -0.003] },
-    Difference { friction: 1.2, mass: 0.8, offset_m: [0.004, 0.004] },
-    Difference { friction: 0.8, mass: 1.2, offset_m: [-0.004, 0.004] },
-    Difference { friction: 1.0, mass: 1.2, offset_m: [-0.004, -0.004] },
-    Difference { friction: 1.0, mass: 0.8, offset_m: [0.004, -0.004] },
+    Difference { friction: 1.0, pads: 1.0, mass: 1.0, offset_m: [0.0, 0.0] },
+    Difference { friction: 0.8, pads: RUBBER, mass: 1.0, offset_m: [0.003, 0.0] },
+    Difference { friction: 1.2, pads: 1.0, mass: 1.0, offset_m: [-0.003, 0.0] },
+    Difference { friction: 0.8, pads: RUBBER, mass: 1.0, offset_m: [0.0, 0.003] },
+    Difference { friction: 1.2, pads: 1.0, mass: 1.0, offset_m: [0.0, -0.003] },
+    Difference { friction: 1.2, pads: RUBBER, mass: 0.8, offset_m: [0.004, 0.004] },
+    Difference { friction: 0.8, pads: RUBBER, mass: 1.2, offset_m: [-0.004, 0.004] },
+    Difference { friction: 1.0, pads: 1.0, mass: 1.2, offset_m: [-0.004, -0.004] },
+    Difference { friction: 1.0, pads: RUBBER, mass: 0.8, offset_m: [0.004, -0.004] },
 ];
 /// Share of the tolerance within which a robust motion brings the objects to their goals.
 const USED_TOLERANCE: f64 = 0.8;
@@ -31,6 +34,8 @@ const USED_TOLERANCE: f64 = 0.8;
 struct Difference {
     /// Factor of all friction coefficients.
     friction: f32,
+    /// Further factor of the friction of pads that grasp.
+    pads: f32,
     /// Factor of the objects' masses.
     mass: f32,
     /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by 180°.
@@ -147,11 +152,12 @@ impl Difference {
             pads: times(friction.pads),
             object: times(friction.object),
         };
+        let grasping = surfaces(config.pick_and_place);
         WorldConfig {
             object_mass_kg: config.object_mass_kg * self.mass,
             table_friction: times(config.table_friction),
             push: surfaces(config.push),
-            pick_and_place: surfaces(config.pick_and_place),
+            pick_and_place: Friction { pads: grasping.pads * self.pads, ..grasping },
             carry_bar: surfaces(config.carry_bar),
             rubber_pads: times(config.rubber_pads),
             ..config.clone()
@@ -231,7 +237,9 @@ mod tests {
         assert_eq!(changed.object_mass_kg, config.object_mass_kg * 1.2);
         let slippery = DIFFERENCES[1].applied_to(&config);
         assert_eq!(slippery.table_friction, config.table_friction * 0.8);
-        assert_eq!(slippery.pick_and_place.pads, config.pick_and_place.pads * 0.8);
+        assert_eq!(slippery.pick_and_place.object, config.pick_and_place.object * 0.8);
+        let pads = [0, 1].map(|idx| DIFFERENCES[idx].applied_to(&config).pick_and_place.pads);
+        assert_eq!(pads, [config.pick_and_place.pads, config.pick_and_place.pads * 0.8 * RUBBER]);
         assert_eq!(slippery.rubber_pads, config.rubber_pads * 0.8);
     }
 }
