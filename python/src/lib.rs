@@ -6,6 +6,7 @@
 mod episode;
 mod policy;
 mod simulation;
+mod task;
 mod vector;
 
 use pyo3::prelude::*;
@@ -17,6 +18,8 @@ mod _native {
     use super::policy::Policy;
     #[pymodule_export]
     use super::simulation::{Simulation, compute_reward};
+    #[pymodule_export]
+    use super::task::task_description;
     #[pymodule_export]
     use super::vector::VectorSimulation;
 }

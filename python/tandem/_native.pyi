@@ -11,6 +11,8 @@ _Bools = NDArray[np.bool_]
 _Observations = tuple[_Floats, _Floats, _Floats]
 _Infos = tuple[_Bools, _Bools, _Bools]
 
+def task_description(name: str, n_arms: int) -> str: ...
+
 class Simulation:
     n_action: int
     observation_bounds: _Floats

@@ -209,7 +209,7 @@ class PolicyServer(Server):
             task, digest, batched = task or policy.task, digest or policy.digest, True
             policy, value = _functions(policy)
         if task is None:
-            raise ServiceError("give the task of the policy: push, pick-and-place or a Task")
+            raise ServiceError("give the task of the policy: the name of a built-in one, such as shared-push, or a Task")
         self.task = Task.built_in(task) if isinstance(task, str) else task
         if len(self.task.arms) != 1:
             raise ServiceError(f"a teacher's policy drives 1 arm, the task has {len(self.task.arms)}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tandem import _native
 from tandem._grpc import ServiceError
 from tandem._proto import task_pb2
 
@@ -194,25 +196,29 @@ class Task:
     """A mirror symmetry; none by default."""
 
     @classmethod
-    def built_in(cls, name: str) -> Task:
-        """Returns a task of Tandem's own simulator for one arm: `push` or `pick-and-place`. Units: metres, radians."""
-        if name not in ("push", "pick-and-place"):
-            raise ServiceError(f"unknown task {name!r}: expected push, pick-and-place or a Task")
-        n_action = 3 if name == "push" else 4
-        bounds = [2.0] * 3 + [25.0] * 6 + [1.0] * 3 + [1.01] * 4 + [2.0] * 3 + [30.0] * 3 + [2.0] * 3 + [1.0] * 3
-        arm = Arm(tuple(range(28)), tuple(range(3)), tuple(range(n_action)))
+    def built_in(cls, name: str, n_arms: int = 1) -> Task:
+        """Returns a task of Tandem's own simulator by its full name, such as `shared-push`. Units: metres, radians.
+
+        Raises:
+            ServiceError: If there is no such task.
+        """
+        try:
+            described = _frozen(json.loads(_native.task_description(name, n_arms)))
+        except ValueError as error:
+            raise ServiceError(f"{error}, or a Task") from error
+        arms = tuple(Arm(**arm) for arm in described.pop("arms"))
+        reflection = Reflection(**described.pop("reflection", {}))
+        manipulation = described.pop("manipulation", {})
+        acting = tuple(
+            ArmManipulation(
+                arm.get("gripper"),
+                tuple(Condition(**condition) for condition in arm["holding"]),
+                tuple(Condition(**condition) for condition in arm["conditions"]),
+            )
+            for arm in manipulation.pop("arms", ())
+        )
         return cls(
-            name=name,
-            n_observation=28,
-            n_goal=3,
-            n_action=n_action,
-            arms=(arm,),
-            achieved_goal=(3, 4, 5),
-            episode_steps=50,
-            tolerance=0.05,
-            reports_contacts=True,
-            observation_bound=bounds,
-            goal_bound=[2.0] * 3,
+            **described, arms=arms, reflection=reflection, manipulation=Manipulation(**manipulation, arms=acting)
         )
 
     def to_message(self) -> task_pb2.TaskDescription:
@@ -285,6 +291,13 @@ class Task:
             manipulation=Manipulation.from_message(message.manipulation),
             reflection=Reflection.from_message(message.reflection),
         )
+
+
+def _frozen(value: Any) -> Any:
+    """Returns `value` with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {key: _frozen(item) for key, item in value.items()}
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def distance(norm: Norm, achieved: NDArray[Any], desired: NDArray[Any]) -> float:

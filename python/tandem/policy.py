@@ -40,8 +40,10 @@ class Policy:
     @property
     def env_id(self) -> str:
         """Name of the environment with the policy's task, for `gymnasium.make`."""
-        arms = "TwoArm" if self.n_arms == 2 and self.task != "carry-bar" else ""
-        return f"tandem/{arms}{self.task.title().replace('-', '')}-v0"
+        task = self.task.removeprefix("shared-")
+        world = "Shared" if task != self.task else ""
+        arms = "TwoArm" if self.n_arms == 2 and task != "carry-bar" else ""
+        return f"tandem/{world}{arms}{task.title().replace('-', '')}-v0"
 
     @property
     def metadata(self) -> dict[str, str]:

@@ -1,5 +1,9 @@
 """Policy servers, alone and behind a teacher."""
 
+import dataclasses
+import json
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -7,12 +11,12 @@ pytest.importorskip("grpc")
 
 import grpc
 import tandem
-from services import ROOT, refusal, service
+from services import ROOT, program, refusal, service
 from tandem._grpc import open_channel
 from tandem._proto import policy_pb2 as pb
 from tandem._proto import policy_pb2_grpc
 
-TEACHER = ROOT / "policies" / "teacher-push-classic.safetensors"
+TEACHER = ROOT / "policies" / "teacher-push.safetensors"
 STUDENT = ROOT / "policies" / "student-push-classic.safetensors"
 RNG = np.random.default_rng(4)
 
@@ -151,7 +155,7 @@ def test_a_failing_policy_is_reported_and_the_server_goes_on():
     [
         (lambda o, g: RNG.uniform(-1, 1, (len(o), 3)), {"task": "push"}, "not a function"),
         (lambda o, g: 3 * follow(o, g), {"task": "push"}, "clip its actions"),
-        (follow, {"task": "lift"}, "unknown task 'lift'"),
+        (follow, {"task": "lift"}, 'unknown task "lift"'),
         (follow, {"task": "push", "digest": "a b"}, "'a b' is not a digest"),
         (follow, {}, "give the task"),
         (tandem.load_policy(STUDENT), {}, "drives 1 arm, this one drives 2"),
@@ -160,6 +164,28 @@ def test_a_failing_policy_is_reported_and_the_server_goes_on():
 def test_a_policy_that_cannot_be_served_is_refused(policy, options, message):
     with pytest.raises(tandem.ServiceError, match=message):
         tandem.PolicyServer(policy, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "n_arms", "flags"),
+    [
+        ("push", 1, "--task push --arms 1 --world classic"),
+        ("shared-pick-and-place", 2, "--task pick-and-place"),
+        ("carry-bar", 2, "--task carry-bar"),
+    ],
+)
+def test_built_in_tasks_are_those_of_the_program(name, n_arms, flags):
+    command = [program(), "env", *flags.split(), "--describe"]
+    described = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    task = json.loads(json.dumps(dataclasses.asdict(tandem.Task.built_in(name, n_arms))))
+    for key in ("name", "n_action", "achieved_goal", "tolerance", "observation_bound"):
+        assert task[key] == described[key], key
+    for key in ("reflection", "manipulation"):
+        assert key not in described or task[key] == described[key], key
+    assert [arm["action"] for arm in task["arms"]] == [arm["action"] for arm in described["arms"]]
+    assert len(task["arms"]) == n_arms
+    with pytest.raises(tandem.ServiceError, match="with 3 arms: expected"):
+        tandem.Task.built_in(name, 3)
 
 
 def test_a_teacher_gives_the_same_advice_from_a_server_as_from_the_file():
