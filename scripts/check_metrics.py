@@ -118,7 +118,7 @@ class Run:
         )
         self.learner.address()
         relay_at = start("relay", "relay", "--connect", learner_at).address()
-        environment_at = start("environment", "environment", "--max-environments", "64").address()
+        environment_at = start("environment", "environment", "--world", "classic", "--max-environments", "64").address()
         bridge_at = start("bridge", "bridge", "--driver", "sim", "--listen", "127.0.0.1:0").address()
         start("worker-1", "worker", "--connect", learner_at, "--teacher", teacher_at, "--env", environment_at)
         start("worker-2", "worker", "--connect", relay_at, "--teacher", teacher_at, "--env", environment_at)

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 METADATA_KEYS = "format run episode seed kind parameter_version task arms policy_digest".split()
-ACTION_PER_ARM = {"push": 3, "pick-and-place": 4}
+ACTION_PER_ARM = {"push": 3, "pick-and-place": 4, "shared-push": 3, "shared-pick-and-place": 4, "carry-bar": 4}
 
 
 class Wrong(Exception):

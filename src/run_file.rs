@@ -231,7 +231,7 @@ fn task_for(changes: &Table) -> anyhow::Result<TaskSpec> {
             })?;
         return TaskSpec::new(description).map_err(|error| anyhow!("description.{error}"));
     }
-    let task = changes.get("task").and_then(Value::as_str).unwrap_or(Task::Push.name());
+    let task = changes.get("task").and_then(Value::as_str).unwrap_or(Task::DEFAULT.name());
     let known_task = task.parse::<Task>().map_err(|_unknown| {
         let names = Task::ALL.map(Task::name).join(", ");
         anyhow!("task is {:?}: expected {names}, or a [description] of the task", shortened(task))

@@ -84,7 +84,7 @@ fn layout(args: &SceneArgs, policy: Option<&EvaluatedPolicy>) -> Result<Layout, 
         check_layout(layout, (args.task, args.world), args.arms)?;
         return Ok(layout);
     }
-    let task = chosen_task(args.task, args.world)?.unwrap_or(Task::Push);
+    let task = chosen_task(args.task, args.world)?.unwrap_or(Task::DEFAULT);
     Ok(Layout::new(task, args.arms.unwrap_or(2)))
 }
 

@@ -124,13 +124,20 @@ struct Values {
     recipes: [Vec<(&'static str, Table)>; 2],
 }
 
+/// For each kind of run, the kinds whose values it need not repeat.
+const GENERALIZED_BY: [&[usize]; 8] = [&[], &[], &[], &[1, 2], &[], &[1, 4], &[2, 4], &[3, 5, 6]];
+
 impl Values {
     fn of_recipes() -> anyhow::Result<Self> {
         let kinds = [
-            ("", Task::Push, 2),
-            ("with one arm", Task::Push, 1),
-            ("in pick-and-place", Task::PickAndPlace, 2),
-            ("in pick-and-place with one arm", Task::PickAndPlace, 1),
+            ("", Task::SharedPush, 2),
+            ("with one arm", Task::SharedPush, 1),
+            ("in pick-and-place", Task::SharedPickAndPlace, 2),
+            ("in pick-and-place with one arm", Task::SharedPickAndPlace, 1),
+            ("in the classic world", Task::Push, 2),
+            ("in the classic world with one arm", Task::Push, 1),
+            ("in classic pick-and-place", Task::PickAndPlace, 2),
+            ("in classic pick-and-place with one arm", Task::PickAndPlace, 1),
         ];
         let of_recipe = |recipe| -> anyhow::Result<Vec<(&'static str, Table)>> {
             let values = |(kind, task, n_arms): (&'static str, Task, usize)| {
@@ -149,12 +156,8 @@ impl Values {
             let values: Vec<(&str, String)> =
                 kinds.iter().map(|(kind, table)| (*kind, text_at(table, key))).collect();
             let (_, usual) = &values[0];
-            // A task that differs with two arms and with one in the same way is named once.
             let differs = |(idx, (_, value)): &(usize, &(&str, String))| {
-                let alike = match idx {
-                    3 => [&values[1].1, &values[2].1].contains(&value),
-                    _ => false,
-                };
+                let alike = GENERALIZED_BY[*idx].iter().any(|of| values[*of].1 == *value);
                 *value != *usual && !alike
             };
             let others = values.iter().enumerate().filter(differs);

@@ -230,7 +230,7 @@ fn the_arms_can_be_stopped_with_the_token_while_unauthenticated_clients_watch_he
 
 #[test]
 fn a_teacher_is_healthy_while_idle_clients_hold_all_its_connections() {
-    let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push-classic.safetensors");
+    let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/policies/teacher-push.safetensors");
     let teacher = Service::start(&["teacher", "--ledger", "memory", "--policy", policy]);
     let address = teacher.address.to_string();
     crowd(&teacher, &[Behavior::OneByte, Behavior::WatchHealth], |teacher| {

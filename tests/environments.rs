@@ -143,8 +143,8 @@ fn an_evaluation_on_a_server_gives_the_results_of_one_in_this_process() {
     let server = Server::start(&[]);
     let command = format!("'{}' env", env!("CARGO_BIN_EXE_tandem"));
     let policies = [
-        ["--policy", "policies/student-push-classic.safetensors"],
-        ["--composed-teachers", "policies/teacher-push-classic.safetensors"],
+        ["--policy", "policies/student-push.safetensors"],
+        ["--composed-teachers", "policies/teacher-push.safetensors"],
     ];
     for (policy, environment) in
         policies.into_iter().zip([["--env", &server.address], ["--env-command", &command]])

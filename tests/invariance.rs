@@ -17,7 +17,7 @@ const STRATEGIES: [(&str, u64); 7] = [
     ("ts2c:0.1", 480),
 ];
 const EAMC: (&str, u64) = ("eamc:0.1", 810);
-const JSRL: (&str, u64) = ("jsrl:20", 440);
+const JSRL: (&str, u64) = ("jsrl:20", 400);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Eight rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
 const SMALL: [&str; 24] = [
@@ -167,7 +167,7 @@ fn metrics(out: &Path) -> Vec<Value> {
 
 fn evaluate_with_threads(n_threads: &str) -> Value {
     let mut args: Vec<String> = vec!["eval".into(), "--json".into(), "--policy".into()];
-    args.push("policies/student-push-classic.safetensors".into());
+    args.push("policies/student-push.safetensors".into());
     args.extend(["--episodes".into(), "40".into(), "--seed".into(), "5".into()]);
     let mut evaluation = last_line(tandem(&args).env("RAYON_NUM_THREADS", n_threads));
     evaluation.as_object_mut().expect("an object").remove("steps_per_s").expect("a speed");

@@ -43,7 +43,7 @@ impl Teacher {
 
     fn spawn(ledger: &str, listen: &str) -> Child {
         let policy =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
         Command::new(env!("CARGO_BIN_EXE_tandem"))
             .args(["--log", "warn", "teacher", "--listen", listen, "--ledger", ledger, "--policy"])
             .arg(policy)
@@ -63,8 +63,7 @@ impl Teacher {
 
 /// Returns the exit code and the single error line of a teacher that refuses to start on `ledger`.
 fn refusal(ledger: &Path) -> (Option<i32>, String) {
-    let policy =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+    let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let output = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args(["--log", "warn", "teacher", "--listen", "127.0.0.1:0", "--exit-with-stdin"])
         .arg("--ledger")

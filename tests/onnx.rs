@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-const TEACHER: &str = "policies/teacher-push-classic.safetensors";
+const TEACHER: &str = "policies/teacher-push.safetensors";
 /// An actor that PyTorch exported, with tanh between its layers.
 const FOREIGN: &str = "onnx/tests/pytorch/normalized-tanh-actor.dynamo.onnx";
 
@@ -91,7 +91,7 @@ fn what_cannot_be_converted_is_refused_in_one_line() {
     refused(
         &[&["policy", "import", &actor][..], &pick].concat(),
         65,
-        "it has 3 numbers, an action of pick-and-place with 1 arm has 4",
+        "it has 3 numbers, an action of shared-pick-and-place with 1 arm has 4",
     );
     refused(&["policy", "import", TEACHER, "--out", &out], 65, "it is not a complete ONNX file");
     refused(&["eval", "--policy", &actor], 64, "is an ONNX model: convert it with `tandem policy");
@@ -159,7 +159,8 @@ fn onnx_models_advise_as_the_policy_file_and_are_kept_for_a_resume() {
 fn a_network_with_tanh_layers_advises_by_its_actions() {
     let files = Files::new();
     let out = files.path("run");
-    let teacher = ["--teacher", FOREIGN, "--strategy", "ea", "--max-env-steps", "800"];
+    let teacher =
+        ["--world", "classic", "--teacher", FOREIGN, "--strategy", "ea", "--max-env-steps", "800"];
     let summary = train(&out, &[&teacher[..], &SMALL].concat());
     assert!(summary["advice_spent"].as_u64() > Some(0), "{summary}");
     assert!(!out.join("policy/teacher-critic.onnx").exists());

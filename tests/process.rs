@@ -320,8 +320,7 @@ fn children_end_when_their_parent_is_killed() {
 
 #[test]
 fn services_print_their_address_and_end_on_sigterm() {
-    let policy =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+    let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let mut teacher = Command::new(env!("CARGO_BIN_EXE_tandem"))
         .args(["teacher", "--ledger", "memory", "--policy"])
         .arg(policy)

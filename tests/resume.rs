@@ -89,8 +89,7 @@ fn saved_files(out: &Path) -> [Vec<u8>; 2] {
 
 /// Writes another teacher for the same task to `directory`.
 fn other_teacher(directory: &Path) -> String {
-    let shipped =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let mut policy = Policy::load(&shipped).expect("ships");
     policy.actor[0] += 0.5;
     let path = directory.join("other.safetensors");

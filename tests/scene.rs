@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 
 const TANDEM: &str = env!("CARGO_BIN_EXE_tandem");
-const STUDENT: &str = "policies/student-pick-and-place-classic.safetensors";
+const STUDENT: &str = "policies/student-pick-and-place.safetensors";
 
 fn scene(args: &[&str]) -> Output {
     Command::new(TANDEM)

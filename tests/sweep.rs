@@ -21,8 +21,12 @@ const SMALL: [(&str, &str); 10] = [
     ("world.substeps", "10"),
 ];
 
-const RUNS: [&str; 4] =
-    ["push-none-seed1", "push-mc-q-0.1-seed1", "push-none-seed2", "push-mc-q-0.1-seed2"];
+const RUNS: [&str; 4] = [
+    "shared-push-none-seed1",
+    "shared-push-mc-q-0.1-seed1",
+    "shared-push-none-seed2",
+    "shared-push-mc-q-0.1-seed2",
+];
 
 fn tandem() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
@@ -108,7 +112,7 @@ fn finished(out: &Path) -> Vec<(&'static str, Vec<u8>, SystemTime)> {
 /// Trains the run that the sweep calls `name` without interruptions and returns its digest.
 fn undisturbed_digest(name: &str, dir: &Path) -> String {
     let (strategy, seed) =
-        name.strip_prefix("push-").expect("push").split_once("-seed").expect("a seed");
+        name.strip_prefix("shared-push-").expect("push").split_once("-seed").expect("a seed");
     let mut command = tandem();
     command.args(["train", "--json", "--max-minutes", "0", "--seed", seed]);
     command.args(["--strategy", &strategy.replacen("mc-q-", "mc-q:", 1)]);
@@ -204,10 +208,10 @@ fn report_has_every_run(out: &Path, directory: &Path) {
         assert!(!cells[24].is_empty(), "test success in {line}");
     }
     let page = fs::read_to_string(out.join("report.html")).expect("written");
-    for text in ["<svg", "push, 2 arms", "MC-Q01"] {
+    for text in ["<svg", "shared-push, 2 arms", "MC-Q01"] {
         assert!(page.contains(text), "{text}");
     }
-    assert!(out.join("report-figures/push-2-success-paper-epochs-strategies.svg").is_file());
+    assert!(out.join("report-figures/shared-push-2-success-paper-epochs-strategies.svg").is_file());
 }
 
 #[test]
@@ -215,7 +219,7 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     let keep = tempfile::tempdir().expect("a directory");
     let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
     let teacher: PathBuf = keep.path().join("teacher.safetensors");
-    let lists = format!("strategies = [\"none\", \"ea\"]\n[teachers]\npush = {teacher:?}");
+    let lists = format!("strategies = [\"none\", \"ea\"]\n[teachers]\nshared-push = {teacher:?}");
     let shorter =
         SMALL.map(|(key, value)| (key, if key == "stop.max_env_steps" { "1600" } else { value }));
     let settings: String =
@@ -226,14 +230,14 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     let message = text(&failed.stderr);
     assert_eq!(failed.status.code(), Some(75), "{message}");
     assert!(
-        message.contains("push-ea-seed1: failed:") && message.contains("teacher.safetensors"),
+        message.contains("shared-push-ea-seed1: failed:")
+            && message.contains("teacher.safetensors"),
         "{message}"
     );
     assert!(message.contains("1 of 2 runs failed"), "{message}");
     assert!(text(&failed.stdout).contains("1 of 2"), "{}", text(&failed.stdout));
 
-    let shipped =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     fs::copy(shipped, &teacher).expect("copies");
     let again = sweep(&file, &out, &["--json"]).output().expect("runs");
     assert!(text(&again.stderr).contains("failed before"), "{}", text(&again.stderr));
@@ -256,7 +260,7 @@ fn runs_of_a_sweep_are_trained_by_several_commands() {
         .expect("writes");
     let only = |n: &str| sweep(&file, &out, &["--json", "--only", n, "--no-dashboard"]);
     let both = ["0", "1"].map(|n| only(n).spawn().expect("starts"));
-    for (run, name) in both.into_iter().zip(["push-none-seed1", "push-none-seed2"]) {
+    for (run, name) in both.into_iter().zip(["shared-push-none-seed1", "shared-push-none-seed2"]) {
         let summary = last_object(&run.wait_with_output().expect("ends"));
         assert_eq!((&summary["finished"], &summary["runs"][0]["name"]), (&1.into(), &name.into()));
     }

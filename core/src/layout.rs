@@ -54,7 +54,7 @@ impl World {
     /// All worlds.
     pub const ALL: [Self; 3] = [Self::Classic, Self::Shared, Self::Slow];
     /// The world of tasks whose world is not named.
-    pub const DEFAULT: Self = Self::Classic;
+    pub const DEFAULT: Self = Self::Shared;
 
     /// Returns the name used on the command line.
     #[must_use]
@@ -114,6 +114,8 @@ impl Task {
     pub const CLASSIC: [Self; 2] = [Self::Push, Self::PickAndPlace];
     /// The tasks in the shared world, in the order of the paper.
     pub const SHARED: [Self; 2] = [Self::SharedPush, Self::SharedPickAndPlace];
+    /// The task of a run that names none.
+    pub const DEFAULT: Self = Self::SharedPush;
 
     /// Returns the name used in files and messages.
     #[must_use]

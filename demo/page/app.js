@@ -8,8 +8,8 @@ const MAX_LOG_BYTES = 64 << 20;
 /** Most control steps between two pictures; a slow machine plays in slow motion instead. */
 const MAX_STEPS_PER_PICTURE = 4;
 const ARMS = ["blue", "orange"];
-const PRETTY = { "push": "Push", "pick-and-place": "Pick and place", "shared-push": "Push, shared world",
-  "shared-pick-and-place": "Pick and place, shared world" };
+const PRETTY = { "push": "Push, classic world", "pick-and-place": "Pick and place, classic world",
+  "shared-push": "Push", "shared-pick-and-place": "Pick and place", "carry-bar": "Carry a bar" };
 
 const $ = id => document.getElementById(id);
 
@@ -19,7 +19,7 @@ class App {
     this.screen = new Screen(simulator, $("canvas"), $("scene"));
     this.start = 0;
     this.isPlaying = true;
-    this.speed = 1;
+    this.speed = Number($("speed").value);
     this.log = null;
     this.owed_s = 0;
     this.times = [];
@@ -293,7 +293,7 @@ class App {
     try {
       // A worker of its own: the scene stays in motion.
       const here = await inWorker(this.policy);
-      const native = (await (await fetch("digests.json")).json())[this.task];
+      const native = (await (await fetch("digests.json")).json())[this.facts.task];
       $("digest-here").textContent = here;
       $("digest-native").textContent = native;
       $("digests").hidden = false;

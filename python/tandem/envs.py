@@ -56,8 +56,8 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     Args:
         task: `"push"`, `"pick-and-place"` or `"carry-bar"`, whose cubes are the handles of one bar.
         n_arms: 1 or 2; 2 for `"carry-bar"`.
-        world: `"classic"` (fast arms whose areas lie next to each other, control steps of 0.04 s), `"shared"` (slow
-            arms that share one area, control steps of 0.25 s) or `"slow"` (the only world of `"carry-bar"`).
+        world: `"shared"` (slow arms that share one area, control steps of 0.25 s), `"classic"` (fast arms whose areas
+            lie next to each other, control steps of 0.04 s) or `"slow"` (the only world of `"carry-bar"`).
         substeps: Physics steps per control step, 20 or 10.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
         render_mode: `"rgb_array"` or None.
@@ -72,7 +72,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         task: str = "push",
         n_arms: int = 2,
         *,
-        world: str = "classic",
+        world: str = "shared",
         substeps: int = 20,
         grasped_start_prob: float = 0.0,
         render_mode: str | None = None,

@@ -62,7 +62,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         task: str = "push",
         n_arms: int = 2,
         *,
-        world: str = "classic",
+        world: str = "shared",
         max_episode_steps: int = EPISODE_STEPS,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         num_threads: int | None = None,

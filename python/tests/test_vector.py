@@ -131,7 +131,7 @@ def test_processes_of_gymnasiums_vector_play_single_environments(rng):
         one, _ = envs.reset(seed=4)
     finally:
         envs.close()
-    two, _ = tandem.TandemVectorEnv(2, "push", 1).reset(seed=4)
+    two, _ = tandem.TandemVectorEnv(2, "push", 1, world="classic").reset(seed=4)
     assert_equal(one, two)
 
 

@@ -30,7 +30,8 @@ pub use recipe::Recipe;
 pub struct RunConfig {
     /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`.
     pub name: String,
-    /// `push`, `pick-and-place` or the name of `description`.
+    /// A built-in task, by its full name: `push` and `pick-and-place` are those of the classic world. Or the name of
+    /// `description`.
     pub task: String,
     /// Arms of the learning policy: 1 or 2, or those of `description`.
     pub arms: usize,

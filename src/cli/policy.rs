@@ -80,7 +80,7 @@ pub(crate) struct ImportArgs {
     /// Task [default: the one in the model's metadata, or the only one that the model fits].
     #[arg(long, value_parser = TaskName::parser(), requires = "arms")]
     pub(crate) task: Option<TaskName>,
-    /// World of the task [default: classic].
+    /// World of the task [default: shared].
     #[arg(long, value_enum, requires = "task")]
     pub(crate) world: Option<WorldName>,
     /// Number of arms [default: as for --task].

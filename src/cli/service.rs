@@ -269,7 +269,7 @@ pub(crate) struct EnvArgs {
     /// Task.
     #[arg(long, value_parser = TaskName::parser(), default_value = "push")]
     pub(crate) task: TaskName,
-    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: classic].
+    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: shared].
     #[arg(long, value_enum, hide_possible_values = true)]
     pub(crate) world: Option<WorldName>,
     /// Number of arms.

@@ -54,8 +54,8 @@ impl TaskName {
 
     pub(crate) const fn in_default_world(self) -> Task {
         match self {
-            Self::Push => Task::Push,
-            Self::PickAndPlace => Task::PickAndPlace,
+            Self::Push => Task::SharedPush,
+            Self::PickAndPlace => Task::SharedPickAndPlace,
             Self::CarryBar => Task::CarryBar,
         }
     }
@@ -115,7 +115,7 @@ pub(crate) fn check_layout(
 
 /// Returns the options that choose `task`.
 pub(crate) fn task_flags(task: Task) -> String {
-    match (task.in_world(World::DEFAULT), task.world()) {
+    match (task.in_world(World::Classic), task.world()) {
         (None, _) => format!("--task {task}"),
         (Some(name), World::DEFAULT) => format!("--task {name}"),
         (Some(name), world) => format!("--task {name} --world {world}"),
@@ -188,14 +188,14 @@ mod tests {
         use clap::Parser as _;
         let parsed = crate::cli::Cli::try_parse_from(["tandem", "train", "--task", "shared-push"]);
         let message = parsed.expect_err("not a name of a task").to_string();
-        assert!(message.contains("use '--task push --world shared'"), "{message}");
+        assert!(message.contains("use '--task push'"), "{message}");
         assert!(message.contains("push, pick-and-place"), "{message}");
     }
 
     #[test]
     fn the_flags_of_a_task_name_its_world_unless_it_is_the_default() {
-        assert_eq!(task_flags(Task::PickAndPlace), "--task pick-and-place");
-        assert_eq!(task_flags(Task::SharedPush), "--task push --world shared");
+        assert_eq!(task_flags(Task::PickAndPlace), "--task pick-and-place --world classic");
+        assert_eq!(task_flags(Task::SharedPush), "--task push");
         assert_eq!(task_flags(Task::CarryBar), "--task carry-bar");
     }
 }

@@ -21,7 +21,7 @@ Examples:
   tandem train              # two arms push, advised by the shipped teacher
   tandem train --settings   # every setting, its meaning and its values
   tandem train --arms 1 --task push --until-success 0.97
-  tandem train --world shared  # both arms share one area and are slow
+  tandem train --world classic  # fast arms whose areas lie next to each other
   tandem train --task carry-bar  # two arms carry one bar
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --strategy jsrl:20 --budget 10000
@@ -47,7 +47,7 @@ pub(crate) struct TrainArgs {
     /// Task [default: push].
     #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
-    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: classic].
+    /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: shared].
     #[arg(long, value_enum, hide_possible_values = true)]
     pub(crate) world: Option<WorldName>,
     /// Number of arms of the trained policy, 1 or 2 [default: 2].

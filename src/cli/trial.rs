@@ -16,7 +16,7 @@ Examples:
   tandem bridge trial --policy policies/student-push.safetensors \\
       --composed-teachers policies/teacher-push.safetensors
   tandem bridge trial --task carry-bar --mode closed-loop \\
-      --composed-teachers policies/teacher-pick-and-place.safetensors
+      --composed-teachers policies/teacher-pick-and-place-classic.safetensors
   tandem report runs/trial-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {

@@ -23,7 +23,7 @@ fn from_text(text: &str) -> Result<RunConfig, String> {
 #[test]
 fn settings_change_only_what_they_name() {
     let config = resolved(&["arms=1", "ddpg.discount=0.9", "advice.budget=7"]).expect("valid");
-    let mut expected = RunConfig::defaults(Recipe::Tandem, Task::Push, 1);
+    let mut expected = RunConfig::defaults(Recipe::Tandem, Task::DEFAULT, 1);
     expected.ddpg.discount = 0.9;
     expected.advice.budget = 7;
     assert_eq!(config, expected);
@@ -154,9 +154,9 @@ fn a_time_limit_replaces_the_recipes_number_of_steps() {
         let stop = resolved(settings).expect("valid").stop;
         (stop.max_env_steps, stop.max_minutes)
     };
-    assert_eq!(limits(&[]), (300_000, 0.0));
+    assert_eq!(limits(&[]), (600_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5"]), (0, 5.0));
-    assert_eq!(limits(&["stop.max_minutes=0"]), (300_000, 0.0));
+    assert_eq!(limits(&["stop.max_minutes=0"]), (600_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5", "stop.max_env_steps=100"]), (100, 5.0));
 }
 

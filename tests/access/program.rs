@@ -99,8 +99,7 @@ impl Workspace {
 
 /// Returns the command line of a teacher.
 pub(crate) fn teacher(more: &[&str]) -> Vec<String> {
-    let policy =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+    let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
     let policy = policy.to_string_lossy();
     let args = [&["teacher", "--ledger", "memory", "--policy", &policy][..], more].concat();
     args.into_iter().map(str::to_owned).collect()

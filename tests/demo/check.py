@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT / "tests" / "dashboard"))
 from devtools import Browser  # noqa: E402
 
 TASKS = ["push", "pick-and-place"]
-MIN_STEPS_PER_S = 24.5
+MIN_STEPS_PER_S = 15.7
 MAX_BYTES = 5_000_000
 MAGIC_BYTES = 8
 DATA_END, FOOTER, METADATA = 0x0F, 0x02, 0x0C
@@ -91,7 +91,7 @@ def wait_for_success(page, what):
     """Waits until both goals are reached; starts elsewhere where the student does not succeed, at most three times."""
     for attempt in range(4):
         try:
-            page.wait("document.getElementById('badge').textContent === 'Both goals reached'", what, 10)
+            page.wait("document.getElementById('badge').textContent === 'Both goals reached'", what, 20)
             return attempt
         except AssertionError:
             if attempt == 3:
@@ -105,9 +105,10 @@ def check_student(page, task):
     page.wait("document.getElementById('badge').textContent !== 'Loading'", f"the student of {task} is loaded")
     restarts = wait_for_success(page, f"the student reaches the goals of {task}")
     before = place_of(page, 0)
-    # The goals of the first arm lie from 24 cm to the left of the centre up to it: drag towards the farther end.
+    # The goals of the first arm lie from 12 cm to the left of the centre to 8 cm to the right of it: drag towards the
+    # farther end.
     page.value(RECORD_BADGE)
-    drag(page, 0, 70 if centimetres_right(page, 0) < -12 else -70, 0)
+    drag(page, 0, 70 if centimetres_right(page, 0) < -2 else -70, 0)
     page.wait(f"Math.abs({PLACE_OF}(0)[0] - {before[0]}) > 25", "the goal follows the pointer", 5)
     page.wait("badgeTexts.some(text => text !== 'Both goals reached')", "the moved goal is not reached", 2)
     n_moves = restarts + wait_for_success(page, f"the student follows a goal of {task}")
@@ -118,7 +119,7 @@ def check_keyboard(page):
     """A goal moves by the arrow keys, and says where it is."""
     page.value("document.getElementById('goal-1').focus()")
     before = centimetres_right(page, 1)
-    name, code, step = ("ArrowLeft", 37, -1) if before > 12 else ("ArrowRight", 39, 1)
+    name, code, step = ("ArrowLeft", 37, -1) if before > 2 else ("ArrowRight", 39, 1)
     for _ in range(3):
         page.key(name, code)
     after = centimetres_right(page, 1)
@@ -137,7 +138,7 @@ def steps_per_s(page, seconds=5):
 
 
 def check_speed(page):
-    """The page keeps up with the 25 control steps per second of the simulated time."""
+    """The page keeps up with the 16 control steps per second of its initial speed, four times that of the arms."""
     fastest = 0.0
     for _ in range(3):
         fastest = max(fastest, steps_per_s(page))
@@ -157,7 +158,8 @@ def check_digests(page, directory):
         page.value("document.getElementById('compute').click()")
         page.wait("!document.getElementById('digest-verdict').hidden", f"the hash of {task} is computed", 120)
         here, verdict = page.value("['digest-here', 'digest-verdict'].map(id => document.getElementById(id).textContent)")
-        assert here == expected[task], f"{task}: {here} in Chromium, expected {expected[task]}"
+        native = expected[f"shared-{task}"]
+        assert here == native, f"{task}: {here} in Chromium, expected {native}"
         assert verdict == "Equal: 1,000 steps, every bit", verdict
         print(f"{task}: {here} in Chromium, as expected")
 

@@ -61,7 +61,7 @@ impl Teacher {
     /// Starts a teacher. Returns `None` if it ends before it listens.
     fn start(device: &Device, fault: Option<&Fault>) -> Option<Self> {
         let policy =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push-classic.safetensors");
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
         let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
         command.args(["--log", "warn", "teacher", "--listen", "127.0.0.1:0", "--ledger"]);
         command.arg(device.root().join("ledger.sqlite")).arg("--policy").arg(policy);

@@ -37,7 +37,10 @@ fn variants_are_added_to_strategies_and_axes_multiply_both() {
     assert_eq!(seen.len(), 8);
     assert_eq!(
         [seen[0], seen[7]],
-        ["push-ea-polyak_keep-0.95-lag-0-seed1", "push-no-cloning-polyak_keep-0.99-lag-1-seed1"]
+        [
+            "shared-push-ea-polyak_keep-0.95-lag-0-seed1",
+            "shared-push-no-cloning-polyak_keep-0.99-lag-1-seed1"
+        ]
     );
     let last = &planned[7].config;
     assert_eq!(
@@ -57,7 +60,7 @@ fn runs_have_no_time_limit_unless_one_is_set() {
 
 #[test]
 fn a_teacher_is_named_if_the_run_needs_one() {
-    let text = "strategies = [\"none\", \"ea\"]\n[teachers]\npush = \"mine.safetensors\"\n";
+    let text = "strategies = [\"none\", \"ea\"]\n[teachers]\nshared-push = \"mine.safetensors\"\n";
     let teachers: Vec<_> = runs_of(&format!("{text}{LIMIT}"))
         .expect("valid")
         .into_iter()
