@@ -11,23 +11,29 @@ import multiprocessing
 import subprocess
 import sys
 import tempfile
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from check_policy import inputs, network, read
-from mujoco_world import ContactModel, MujocoWorld
+from mujoco_world import ARM_ARM, ContactModel, MujocoWorld
 
 ROOT = Path(__file__).resolve().parent.parent
 SHIPPED = [
-    ROOT / "policies" / f"{role}-{task}-classic.safetensors"
+    ROOT / "policies" / f"{role}-{task}{world}.safetensors"
+    for world in ("", "-classic")
     for task in ("push", "pick-and-place")
     for role in ("student", "teacher")
 ]
+# For each world the control steps in which hands rise above the objects before their free motion is compared.
+RISING_STEPS = {"shared": 2, "classic": 5}
+# Tasks and numbers of arms whose motion without contact is compared.
+FREE_MOTIONS = [("push", 1), ("pick-and-place", 1), ("pick-and-place", 2)]
 EXAMPLES = """examples:
   python scripts/mujoco_transfer.py                               all shipped policies, 240 goals each
-  python scripts/mujoco_transfer.py policies/student-push-classic.safetensors --episodes 60 --json
-  python scripts/mujoco_transfer.py policies/teacher-push-classic.safetensors --arms 2     two copies of the teacher
+  python scripts/mujoco_transfer.py policies/student-push.safetensors --episodes 60 --json
+  python scripts/mujoco_transfer.py policies/teacher-push.safetensors --arms 2     two copies of the teacher
   python scripts/mujoco_transfer.py --check                       compares the engines without policies
   python scripts/mujoco_transfer.py --mujoco-defaults             with MuJoCo's own contact parameters
 
@@ -63,11 +69,7 @@ def tandem(program, *arguments):
         raise Wrong(f"{program} does not exist: build it with `cargo build --release`, or give --tandem") from None
     except subprocess.CalledProcessError as error:
         raise Wrong(error.stderr.strip() or f"{program} ended with {error.returncode}") from None
-    scene = json.loads(done.stdout)
-    world = scene["world"]
-    if world["kinematics"]["arm"] != "jaco":
-        raise Wrong(f"{world['task']}: its hands tilt, and only hands that point down can be simulated in MuJoCo")
-    return scene
+    return json.loads(done.stdout)
 
 
 def wilson(hits, n):
@@ -121,14 +123,21 @@ def play_all(scene, contact, path, how, label, arguments):
     return results
 
 
-def summary(successes, collided):
+def summary(successes, contacts):
+    """Shares of episodes, from their successes and the contacts of their steps. `touched` is about the arms."""
     n = len(successes)
-    low, high = wilson(sum(successes), n)
+    touched = [any(ARM_ARM in kinds for kinds in steps) for steps in contacts]
+    clean = [success and not touch for success, touch in zip(successes, touched)]
+    (low, high), (clean_low, clean_high) = (wilson(sum(hits), n) for hits in (successes, clean))
     return {
         "success": sum(successes) / n,
         "success_low": low,
         "success_high": high,
-        "collision_rate": sum(collided) / n,
+        "success_without_arm_contact": sum(clean) / n,
+        "success_without_arm_contact_low": clean_low,
+        "success_without_arm_contact_high": clean_high,
+        "arm_contact_rate": sum(touched) / n,
+        "collision_rate": sum(any(steps) for steps in contacts) / n,
     }
 
 
@@ -153,37 +162,38 @@ def transfer(path, arguments):
         "policy": str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path),
         "episodes": len(goals),
         "seed": arguments.seed,
-        "rapier": summary(in_rapier, [any(episode["contacts"]) for episode in scene["episodes"]]),
-        "mujoco": summary(in_mujoco, [any(contacts) for _, contacts in played]),
+        "rapier": summary(in_rapier, [episode["contacts"] for episode in scene["episodes"]]),
+        "mujoco": summary(in_mujoco, [contacts for _, contacts in played]),
         "only_rapier": [idx for idx, pair in enumerate(zip(in_rapier, in_mujoco)) if pair == (True, False)],
         "only_mujoco": [idx for idx, pair in enumerate(zip(in_rapier, in_mujoco)) if pair == (False, True)],
     }
 
 
 def print_transfer(results):
-    engines = " | ".join(f"{engine} success | 95 % interval | contacts" for engine in ("rapier", "MuJoCo"))
+    """Prints the rates as a table; "no contact" is success in an episode in which the arms do not touch each other."""
+    columns = "success | 95 % interval | no contact | 95 % interval"
+    engines = " | ".join(f"{engine} {columns}" for engine in ("rapier", "MuJoCo"))
     print(f"| task | arms | policy | {engines} |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("|" + 11 * "---|")
     for result in results:
         cells = [result["task"], str(result["arms"]), Path(result["policy"]).stem]
         for engine in ("rapier", "mujoco"):
             rates = result[engine]
-            cells += [
-                f"{rates['success']:.3f}",
-                f"{rates['success_low']:.3f}–{rates['success_high']:.3f}",
-                f"{rates['collision_rate']:.3f}",
-            ]
+            for rate in ("success", "success_without_arm_contact"):
+                cells += [f"{rates[rate]:.3f}", f"{rates[f'{rate}_low']:.3f}–{rates[f'{rate}_high']:.3f}"]
         print("| " + " | ".join(cells) + " |")
 
 
-def free_motion(task, n_arms, n_episodes, n_steps=50):
-    """Random actions of hands that rise first and then stay high above the objects, [episodes][steps][n_action]."""
+def free_motion(task, n_arms, n_episodes, n_rising, n_steps=50):
+    """Random actions of hands that rise for `n_rising` steps and then stay above the objects,
+    [episodes][steps][n_action].
+    """
     rng = np.random.default_rng(1)
     n_action = 4 if task == "pick-and-place" else 3
     held = rng.uniform(-1.0, 1.0, (n_episodes, n_steps // 5, n_arms, n_action))
     actions = np.repeat(held, 5, axis=1)
     actions[:, :, :, 2] = 0.0
-    actions[:, :5, :, 0:2], actions[:, :5, :, 2] = 0.0, 1.0
+    actions[:, :n_rising, :, 0:2], actions[:, :n_rising, :, 2] = 0.0, 1.0
     return actions.reshape(n_episodes, n_steps, -1)
 
 
@@ -224,18 +234,18 @@ def check(arguments):
             )
 
     hand, thing, openings = ("hand", slice(0, 3)), ("object", slice(3, 6)), ("openings", slice(9, 12))
-    for task, n_arms in (("push", 1), ("pick-and-place", 1), ("pick-and-place", 2)):
+    for (world, n_rising), (task, n_arms) in product(RISING_STEPS.items(), FREE_MOTIONS):
         with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
-            json.dump(free_motion(task, n_arms, n_episodes).tolist(), file)
+            json.dump(free_motion(task, n_arms, n_episodes, n_rising).tolist(), file)
             file.flush()
-            options = ["--task", task, "--arms", n_arms, "--actions", file.name, "--seed", arguments.seed]
-            scene = tandem(arguments.tandem, *options)
+            options = ["--task", task, "--world", world, "--arms", n_arms, "--actions", file.name]
+            scene = tandem(arguments.tandem, *options, "--seed", arguments.seed)
         quantities = [hand, openings] if task == "pick-and-place" else [hand]
-        compare(f"{task}, {n_arms} arm(s), no contact", scene, quantities)
+        compare(f"{scene['world']['task']}, {n_arms} arm(s), no contact", scene, quantities)
     for path in SHIPPED:
         options = ["--policy", path, "--episodes", n_episodes, "--seed", arguments.seed]
         scene = tandem(arguments.tandem, *options)
-        quantities = [hand, openings, thing] if scene["world"]["task"] == "pick-and-place" else [hand, thing]
+        quantities = [hand, openings, thing] if scene["world"]["arms"][0]["fingers"] else [hand, thing]
         compare(f"{scene['world']['task']}, actions of the {path.stem.split('-')[0]} in rapier", scene, quantities)
     return rows
 
@@ -264,7 +274,7 @@ def parse(argv):
     )
     default = ContactModel()
     parser.add_argument(
-        "policies", nargs="*", type=Path, metavar="FILE", help="policies [default: the four shipped ones]"
+        "policies", nargs="*", type=Path, metavar="FILE", help="policies [default: the eight shipped ones]"
     )
     parser.add_argument("--arms", type=int, choices=(1, 2), help="2: one-arm policies control two arms, each its own")
     parser.add_argument("--episodes", type=int, default=240, help="goals per policy [default: 240]")
@@ -291,7 +301,7 @@ def parse(argv):
         "--impratio", type=float, default=default.impratio, help="frictional to normal impedance [default: %(default)s]"
     )
     contact.add_argument(
-        "--refinement", type=int, default=1, metavar="N", help="divide MuJoCo's step of 1 ms by N [default: 1]"
+        "--refinement", type=int, default=1, metavar="N", help="divide MuJoCo's step by N [default: 1]"
     )
     arguments = parser.parse_args(argv)
     for name in ("episodes", "processes", "refinement"):
