@@ -267,6 +267,7 @@ fn env_steps(run: &Run) -> Option<f64> {
     Some(run.last()?.env_steps as f64)
 }
 
+/// Returns the title of a table of costs.
 fn cost_title(section: &Section, measure: Quantity) -> String {
     let of_what = match measure {
         Quantity::SuccessWithoutContact => "success without contact",

@@ -52,12 +52,13 @@ impl TaskName {
         }
     }
 
-    pub(crate) const fn in_default_world(self) -> Task {
-        match self {
-            Self::Push => Task::SharedPush,
-            Self::PickAndPlace => Task::SharedPickAndPlace,
+    pub(crate) fn in_default_world(self) -> Task {
+        let task = match self {
+            Self::Push => Task::Push,
+            Self::PickAndPlace => Task::PickAndPlace,
             Self::CarryBar => Task::CarryBar,
-        }
+        };
+        task.in_world(World::DEFAULT).unwrap_or(task)
     }
 }
 
