@@ -91,7 +91,7 @@ def wait_for_success(page, what):
     """Waits until both goals are reached; starts elsewhere where the student does not succeed, at most three times."""
     for attempt in range(4):
         try:
-            page.wait("document.getElementById('badge').textContent === 'Both goals reached'", what, 20)
+            page.wait("document.getElementById('badge').textContent === 'Both goals reached'", what, 16)
             return attempt
         except AssertionError:
             if attempt == 3:
