@@ -1,4 +1,4 @@
-//! `tandem report`: compares runs and trials on the terminal, as an HTML page, as JSON and as CSV.
+//! `tandem report`: compares runs and trials on the terminal, as an HTML page, as JSON, as CSV and as Markdown.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -39,9 +39,13 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
     let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
-    if let Some(path) = &args.csv {
-        std::fs::write(path, export::csv(&comparison))
-            .or_cannot_write(|| format!("cannot write {}", path.display()))?;
+    let tables: [(_, fn(&Comparison) -> String); 2] =
+        [(&args.csv, export::csv), (&args.markdown, Comparison::markdown)];
+    for (path, format) in tables {
+        if let Some(path) = path {
+            std::fs::write(path, format(&comparison))
+                .or_cannot_write(|| format!("cannot write {}", path.display()))?;
+        }
     }
     print(args, &comparison, &trials, &files)
 }
@@ -74,8 +78,10 @@ fn print(
         let n_figures = counted(files.plots.len(), "file");
         output::print(format_args!("figures       {}: {n_figures}", directory.display()))?;
     }
-    if let Some(path) = &args.csv {
-        output::print(format_args!("csv           {}", path.display()))?;
+    for (label, path) in [("csv", &args.csv), ("markdown", &args.markdown)] {
+        if let Some(path) = path {
+            output::print(format_args!("{label:<13} {}", path.display()))?;
+        }
     }
     Ok(())
 }

@@ -185,11 +185,15 @@ fn an_interrupted_sweep_ends_with_the_bits_of_undisturbed_runs() {
 /// Checks the report on the finished sweep: two strategies with two seeds, four evaluations per undisturbed run.
 fn report_has_every_run(out: &Path, directory: &Path) {
     let csv = directory.join("runs.csv");
-    let report = tandem().arg("report").arg(out).arg("--csv").arg(&csv).output().expect("runs");
+    let markdown = directory.join("runs.md");
+    let mut report = tandem();
+    report.arg("report").arg(out).arg("--csv").arg(&csv).arg("--markdown").arg(&markdown);
+    let report = report.output().expect("runs");
     assert!(report.status.success() && report.stderr.is_empty(), "{}", text(&report.stderr));
     let table = text(&report.stdout);
-    let is_path =
-        |line: &str| ["report ", "figures ", "csv "].iter().any(|label| line.starts_with(label));
+    let is_path = |line: &str| {
+        ["report ", "figures ", "csv ", "markdown "].iter().any(|label| line.starts_with(label))
+    };
     assert!(table.lines().all(|line| is_path(line) || line.chars().count() <= 80));
     for strategy in ["none", "mc-q:0.1"] {
         let line = table.lines().find(|line| line.starts_with(&format!("{strategy} ")));
@@ -207,6 +211,9 @@ fn report_has_every_run(out: &Path, directory: &Path) {
         assert!(if was_disturbed { n_evaluations > 0 } else { n_evaluations == 4 }, "{line}");
         assert!(!cells[24].is_empty(), "test success in {line}");
     }
+    let tables = fs::read_to_string(&markdown).expect("written");
+    let rows = tables.lines().filter(|line| line.starts_with("| mc-q:0.1 |"));
+    assert!(tables.starts_with("### shared-push, 2 arms: ") && rows.count() == 4, "{tables}");
     let page = fs::read_to_string(out.join("report.html")).expect("written");
     for text in ["<svg", "shared-push, 2 arms", "MC-Q01"] {
         assert!(page.contains(text), "{text}");

@@ -89,6 +89,13 @@ impl Comparison {
         Self { sections, films: Vec::new() }
     }
 
+    /// Formats the tables of all values as Markdown.
+    #[must_use]
+    pub fn markdown(&self) -> String {
+        let tables = self.sections.iter().flat_map(Section::tables);
+        tables.map(|table| table.markdown()).collect::<Vec<_>>().join("\n")
+    }
+
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
     #[must_use]
     pub fn text(&self) -> String {
@@ -407,13 +414,13 @@ mod tests {
         };
         assert_eq!(
             row(&section.measures(), "mc-q:0.1"),
-            "2; 15.0 (10.0–20.0); 20.0 (20.0–20.0); 0.9250 (0.9000–0.9500); 0.0242 (0.0214–0.0270)"
+            "2; 15.0 (10.0–20.0); 20.0; 0.9250 (0.9000–0.9500); 0.0242 (0.0214–0.0270)"
         );
         assert_eq!(row(&section.measures(), "none"), "1; –; –; 0.0000; –");
         assert_eq!(
             row(&section.cost(Quantity::Success), "mc-q:0.1"),
             "50k (40k–60k); 70k (60k–80k); 100k, 1 of 2; 3.8 (3.0–4.5); 5.2 (4.5–6.0); 7.5, 1 of 2; 35k (30k–40k); \
-             14k (12k–16k); –; 20k (20k–20k); –"
+             14k (12k–16k); –; 20k; –"
         );
         let text = comparison.text();
         assert_eq!(

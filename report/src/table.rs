@@ -55,6 +55,20 @@ impl Table {
         format!("{title}{}", rows.collect::<String>())
     }
 
+    /// Formats the table as Markdown, below its title as a heading. The first column is left-aligned.
+    #[must_use]
+    pub fn markdown(&self) -> String {
+        let line = |cells: &[String]| {
+            let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+            format!("| {} |\n", cells.join(" | "))
+        };
+        let alignments: String = (0..self.header.len())
+            .map(|column| if column == 0 { "---|" } else { "---:|" })
+            .collect();
+        let rows: String = self.rows.iter().map(|row| line(row)).collect();
+        format!("### {}\n\n{}|{alignments}\n{rows}", self.title, line(&self.header))
+    }
+
     /// Formats each row as a block: its first cell, then a line for each other cell.
     fn blocks(&self) -> String {
         let names = self.header.iter().skip(1);
@@ -101,17 +115,15 @@ fn n_chars(text: &str) -> usize {
     text.chars().count()
 }
 
-/// Formats a value over the runs of a group: the mean and, for several runs, the range and the number of runs that have
-/// it.
+/// Formats a value over the runs of a group: the mean, the range if runs differ, and the number of runs that have it if
+/// some do not.
 pub(crate) fn spread(spread: &Spread, format: impl Fn(f64) -> String) -> String {
     let Spread { n, n_runs, mean, min, max } = *spread;
     if n == 0 {
         return NONE.to_owned();
     }
-    let range = match n {
-        1 => String::new(),
-        _ => format!(" ({}–{})", format(min), format(max)),
-    };
+    let [low, high] = [min, max].map(&format);
+    let range = if low == high { String::new() } else { format!(" ({low}–{high})") };
     let how_many = if n < n_runs { format!(", {n} of {n_runs}") } else { String::new() };
     format!("{}{range}{how_many}", format(mean))
 }
@@ -215,6 +227,7 @@ mod tests {
         assert_eq!(text(&[2.0], 1), "2.0");
         assert_eq!(text(&[1.0, 3.0], 2), "2.0 (1.0–3.0)");
         assert_eq!(text(&[1.0, 3.0], 3), "2.0 (1.0–3.0), 2 of 3");
+        assert_eq!(text(&[2.0, 2.01], 2), "2.0");
         assert_eq!(text(&[2.0], 3), "2.0, 1 of 3");
         assert_eq!(text(&[], 3), NONE);
     }
@@ -227,6 +240,14 @@ mod tests {
         let text = table.text();
         let ends: Vec<usize> = text.lines().skip(1).map(|line| line.chars().count()).collect();
         assert_eq!(ends, [20, 20, 20], "{text}");
+    }
+
+    #[test]
+    fn markdown_has_a_line_for_the_header_and_each_row() {
+        let mut table = Table::new("heading".to_owned(), &["strategy", "IE"]);
+        table.rows = vec![vec!["a|b".to_owned(), "1.0–2.0".to_owned()]];
+        let expected = "### heading\n\n| strategy | IE |\n|---|---:|\n| a\\|b | 1.0–2.0 |\n";
+        assert_eq!(table.markdown(), expected);
     }
 
     #[test]

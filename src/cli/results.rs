@@ -139,6 +139,9 @@ pub(crate) struct ReportArgs {
     /// Also writes a CSV file with one line per run.
     #[arg(long, value_name = "FILE.csv")]
     pub(crate) csv: Option<PathBuf>,
+    /// Also writes the tables of all values, with ranges and intervals, as Markdown.
+    #[arg(long, value_name = "FILE.md")]
+    pub(crate) markdown: Option<PathBuf>,
     /// Output of `tandem eval --json`, shown as a row with the file's name; can be repeated.
     #[arg(long = "eval", value_name = "FILE.json")]
     pub(crate) evals: Vec<PathBuf>,
