@@ -39,15 +39,16 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
     let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
-    let tables: [(_, fn(&Comparison) -> String); 2] =
-        [(&args.csv, export::csv), (&args.markdown, Comparison::markdown)];
-    for (path, format) in tables {
-        if let Some(path) = path {
-            std::fs::write(path, format(&comparison))
-                .or_cannot_write(|| format!("cannot write {}", path.display()))?;
-        }
-    }
+    write(args.csv.as_deref(), || export::csv(&comparison))?;
+    write(args.markdown.as_deref(), || comparison.markdown())?;
     print(args, &comparison, &trials, &files)
+}
+
+/// Writes `text` to a file that the command line names.
+fn write(path: Option<&Path>, text: impl FnOnce() -> String) -> Result<(), Failed> {
+    path.map_or(Ok(()), |path| {
+        std::fs::write(path, text()).or_cannot_write(|| format!("cannot write {}", path.display()))
+    })
 }
 
 fn print(
