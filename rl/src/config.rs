@@ -361,6 +361,18 @@ impl RunConfig {
         self.replay.contact_cost * (1.0 + self.share_of_part(round, 0.1, 0.5) * growth)
     }
 
+    /// Returns the discount in round `round`, from 0. Its horizon grows between one quarter and three quarters of the run.
+    #[must_use]
+    pub fn discount(&self, round: u64) -> f32 {
+        let share = self.share_of_part(round, 0.25, 0.75);
+        if self.ddpg.final_discount == 0.0 || share == 0.0 {
+            return self.ddpg.discount;
+        }
+        let horizon = |discount: f32| 1.0 / (1.0 - discount);
+        let (first, last) = (horizon(self.ddpg.discount), horizon(self.ddpg.final_discount));
+        1.0 - 1.0 / (first + share * (last - first))
+    }
+
     /// Returns the weight of behaviour cloning in round `round`, from 0.
     #[must_use]
     pub fn bc_weight(&self, round: u64) -> f32 {

@@ -308,6 +308,11 @@ impl Ddpg {
         critic.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
+    /// Sets the discount for the updates that follow.
+    pub const fn set_discount(&mut self, discount: f32) {
+        self.config.discount = discount;
+    }
+
     /// Sets the weight of behaviour cloning for the updates that follow.
     pub const fn set_bc_weight(&mut self, weight: f32) {
         self.config.bc_weight = weight;

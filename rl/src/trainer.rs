@@ -243,6 +243,7 @@ impl Trainer {
             goal: self.goal_normalizer.snapshot(),
         };
         self.ddpg.set_cooldown(self.config.is_cooldown(self.counters.round));
+        self.ddpg.set_discount(self.config.discount(self.counters.round));
         self.ddpg.set_bc_weight(self.config.bc_weight(self.counters.round));
         self.ddpg.set_bc_filter(self.config.filters_advice(self.counters.round));
         self.sampler.set_contact_cost(self.config.contact_cost(self.counters.round));

@@ -95,6 +95,19 @@ fn cloning_fades_over_the_middle_half_of_a_run() {
 }
 
 #[test]
+fn the_horizon_of_the_discount_grows_over_the_middle_half_of_a_run() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 80_000;
+    config.ddpg.final_discount = 0.0;
+    assert!((0..=100).all(|round| config.discount(round) == config.ddpg.discount), "it stays");
+    (config.ddpg.discount, config.ddpg.final_discount) = (0.5, 0.875);
+    let discounts = [0, 25, 50, 75, 100].map(|round| config.discount(round));
+    assert_eq!(discounts, [0.5, 0.5, 0.8, 0.875, 0.875], "horizons of 2, 5 and 8 steps");
+    config.stop.max_env_steps = 0;
+    assert_eq!(config.discount(50), 0.5, "without an end");
+}
+
+#[test]
 fn a_bad_value_is_named() {
     let check = |change: fn(&mut RunConfig), key| {
         let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);

@@ -14,6 +14,10 @@ const MAX_TRANSITIONS: usize = 65_536;
 pub struct DdpgConfig {
     /// Discount per control step, in [0, 1) (paper, section 4.1: 0.98).
     pub discount: f32,
+    /// Discount from three quarters of the run's environment steps on, in [0, 1). From one quarter, the horizon
+    /// 1 / (1 - discount) grows linearly until then. A run without a limit in environment steps, and 0, keep `discount`.
+    #[serde(default)]
+    pub final_discount: f32,
     /// Weight of the mean squared action in the actor's loss, 0 or more (HER reference implementation: `action_l2` =
     /// 1).
     pub action_penalty: f32,
@@ -58,6 +62,7 @@ impl Default for DdpgConfig {
     fn default() -> Self {
         Self {
             discount: 0.95,
+            final_discount: 0.0,
             action_penalty: 0.1,
             bc_weight: 2.0,
             bc_final_fraction: all_of_it(),
@@ -100,8 +105,12 @@ impl DdpgConfig {
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        let is_discount = (0.0..1.0).contains(&self.discount);
-        OutOfRange::unless(is_discount, "ddpg.discount", self.discount, "a number in [0, 1)")?;
+        for (key, discount) in
+            [("ddpg.discount", self.discount), ("ddpg.final_discount", self.final_discount)]
+        {
+            let is_discount = (0.0..1.0).contains(&discount);
+            OutOfRange::unless(is_discount, key, discount, "a number in [0, 1)")?;
+        }
         for (key, weight) in
             [("ddpg.action_penalty", self.action_penalty), ("ddpg.bc_weight", self.bc_weight)]
         {

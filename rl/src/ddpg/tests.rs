@@ -367,6 +367,7 @@ fn settings_out_of_range_are_named() {
         assert_eq!(small(change).check().map_err(|error| error.key), Err(key));
     };
     check(|config| config.discount = 1.0, "ddpg.discount");
+    check(|config| config.final_discount = f32::NAN, "ddpg.final_discount");
     check(|config| config.polyak_keep = f32::NAN, "ddpg.polyak_keep");
     check(|config| config.bc_weight = -1.0, "ddpg.bc_weight");
     check(|config| config.action_penalty = f32::INFINITY, "ddpg.action_penalty");
