@@ -57,6 +57,7 @@ ELSEWHERE = [
     Entry("python scripts/plot_benchmarks.py", "needs matplotlib", ""),
     Entry("python scripts/bench_sb3.py", "needs PyTorch and trains for hours", ""),
     Entry("python scripts/mujoco_transfer.py", "needs MuJoCo", "scripts/smoke.sh"),
+    Entry("python scripts/failures.py", "needs the Python package", "scripts/test-python"),
     Entry("scripts/table-2", "writes a page of the guide", ".ci/run"),
     # A program that is built in another way.
     Entry("target/release/tandem train", "needs the feature otlp", "tests/otlp.rs"),

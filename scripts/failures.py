@@ -1,0 +1,84 @@
+#!/usr/bin/env python3
+"""How a policy with several arms fails: plays episodes and counts what the arms without success did.
+
+An arm *touched* its object if the object ends more than 2 cm from its start, and is *at* it if its hand ends within
+5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm.
+"""
+
+import argparse
+import sys
+
+import gymnasium
+import numpy as np
+
+import tandem
+
+MOVED_M = 0.02
+NEAR_M = 0.05
+EXAMPLES = """examples:
+  python scripts/failures.py policies/student-pick-and-place.safetensors
+  python scripts/failures.py runs/a/policy/best.safetensors --episodes 4000 --seed 20000
+
+Needs: pip install ./python
+"""
+
+
+def play(policy, n_envs, seed):
+    """Plays an episode in each environment. Returns starts, ends, goals and hands, each [n_envs, n_arms, 3], metres in
+    the arms' frames."""
+    envs = gymnasium.make_vec(policy.env_id, num_envs=n_envs)
+    n_steps = envs.spec.max_episode_steps
+    observation, _ = envs.reset(seed=seed)
+
+    def places(values):
+        return values.reshape(n_envs, policy.n_arms, -1)[:, :, :3].copy()
+
+    starts = places(observation["achieved_goal"])
+    for _ in range(n_steps):
+        action, _ = policy.predict(observation)
+        observation, *_ = envs.step(action)
+    ends, goals = places(observation["achieved_goal"]), places(observation["desired_goal"])
+    # The first three numbers of an arm's observation are the place of its hand.
+    return starts, ends, goals, places(observation["observation"])
+
+
+def distances(some, others):
+    """Returns the distances between places, [n_envs, n_arms], metres."""
+    return np.linalg.norm(some - others, axis=2)
+
+
+def count(starts, ends, goals, hands, tolerance_m):
+    """Returns the failed episodes and, of the arms without success, how many touched their objects and are at them."""
+    failed = distances(ends, goals) > tolerance_m
+    touched, near = distances(starts, ends) > MOVED_M, distances(hands, ends) < NEAR_M
+    return {
+        "episodes": len(failed),
+        "failed episodes": int(failed.any(axis=1).sum()),
+        "arms without success": int(failed.sum()),
+        "object not touched, hand away": int((failed & ~touched & ~near).sum()),
+        "object not touched, hand at it": int((failed & ~touched & near).sum()),
+        "object touched, hand away": int((failed & touched & ~near).sum()),
+        "object touched, hand at it": int((failed & touched & near).sum()),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("policy", help="policy file for push or pick-and-place")
+    parser.add_argument("--episodes", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=10_000, help="seed of the starts and goals")
+    args = parser.parse_args()
+    try:
+        policy = tandem.load_policy(args.policy)
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    if "carry-bar" in policy.task:
+        sys.exit("error: carry-bar has one object for both arms: expected a policy for push or pick-and-place")
+    for name, value in count(*play(policy, args.episodes, args.seed), tolerance_m=0.05).items():
+        print(f"{value:6}  {name}")
+
+
+if __name__ == "__main__":
+    main()
