@@ -62,13 +62,20 @@ def count(starts, ends, goals, hands, tolerance_m):
     }
 
 
+def positive(text):
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: expected 1 or more")
+    return number
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("policy", help="policy file for push or pick-and-place")
-    parser.add_argument("--episodes", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=10_000, help="seed of the starts and goals")
+    parser.add_argument("--episodes", type=positive, default=2000, help="number of episodes [default: 2000]")
+    parser.add_argument("--seed", type=int, default=10_000, help="seed of the starts and goals [default: 10000]")
     args = parser.parse_args()
     try:
         policy = tandem.load_policy(args.policy)

@@ -15,7 +15,7 @@ pub struct DdpgConfig {
     /// Discount per control step, in [0, 1) (paper, section 4.1: 0.98).
     pub discount: f32,
     /// Discount from three quarters of the run's environment steps on, in [0, 1). From one quarter, the horizon
-    /// 1 / (1 - discount) grows linearly until then. A run without a limit in environment steps, and 0, keep `discount`.
+    /// 1 / (1 - discount) grows linearly until then. 0 keeps `discount`, as does a run without a limit in environment steps.
     #[serde(default)]
     pub final_discount: f32,
     /// Weight of the mean squared action in the actor's loss, 0 or more (HER reference implementation: `action_l2` =
