@@ -6,18 +6,20 @@
 //! velocities and the status timer in turn, each call of the arm's interface takes a while, and the newest velocity
 //! replaces one that waits.
 
-use std::collections::{BTreeMap, VecDeque};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use tandem_bridge::{ArmCommand, Command, Driver as _, Order, PairState};
+use tandem_bridge::{Command, Driver as _, Order, PairState};
 use tandem_kinematics::Joints;
 use tungstenite::{Message, WebSocket};
 
 use crate::drivers::rig::SharedPair;
+
+mod node;
+pub(crate) use node::{Fault, Node};
 
 pub(crate) const NODES: [&str; 2] = ["/left/m1n4s200_driver", "/right/m1n4s200_driver"];
 /// The duration of `in/start` in periods, in which a node does nothing else.
@@ -32,85 +34,11 @@ const PERIOD_US: u64 = 10_000;
 /// The initial time of ROS' clock, seconds.
 const EPOCH_S: u64 = 1_700_000_000;
 
-/// A fault of the arms' side.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Fault {
-    /// A position is `null`.
-    Null,
-    /// A position is `NaN`, which is not JSON.
-    Nan,
-    /// The joints have other names.
-    Names,
-    /// The connection is closed.
-    Close,
-    /// This many arms report nothing.
-    Silent(usize),
-    /// Every state is sent twice, followed by the previous one.
-    Again,
-    /// The second arm's clock is two seconds ahead.
-    Clock,
-    /// A service fails.
-    Refuses(&'static str),
-    /// Services do not respond.
-    NoAnswers,
-    /// rosbridge reports an error.
-    Complains,
-    /// rosbridge does not publish velocities.
-    Lags,
-    /// rosbridge drops some velocities, as a queue of length 1 does.
-    Drops,
-    /// Another node moves the first arm.
-    Stranger,
-    /// The second arm's own command is not where the arm is.
-    Elsewhere,
-    /// Goals of joint angles are aborted.
-    Aborts,
-    /// Something presses on joint 2 of the first arm with 6 N m.
-    Presses,
-    /// The second node logs an error.
-    Logs,
-}
-
 /// The arms' side.
 #[derive(Clone)]
 pub(crate) struct Side {
     pub(crate) address: SocketAddr,
     ros: Arc<Mutex<Ros>>,
-}
-
-/// An arm's node.
-#[derive(Default)]
-pub(crate) struct Node {
-    pub(crate) stopped: bool,
-    /// The velocities of this period, radians per second.
-    rates: Option<Joints>,
-    opening: f64,
-    /// Whether the arm's control type is angular. `in/start` restarts the interface.
-    is_angular: bool,
-    goal: Option<(String, u32)>,
-    homing: bool,
-    /// The pending call of `in/start` or `in/home_arm` and the periods until its response.
-    starting: Option<(Value, u32)>,
-    /// The velocity that waits for the node's thread.
-    waiting: Option<Joints>,
-    /// The velocities in the arm's own queue.
-    points: VecDeque<Joints>,
-    /// True if the thread handled a status last.
-    status_last: bool,
-    /// When the node's thread is free again, and when its status timer expires; microseconds.
-    free_us: u64,
-    status_us: u64,
-    /// Velocities that the arm received from the node, and states that the node published.
-    pub(crate) n_taken: usize,
-    pub(crate) n_states: usize,
-    /// Messages with velocities.
-    pub(crate) n_velocities: usize,
-    /// Velocities that arrived while the fingers moved.
-    pub(crate) n_while_busy: usize,
-    /// Goals for the fingers, in turns.
-    pub(crate) goals: Vec<Value>,
-    /// The number of calls of a service.
-    pub(crate) calls: BTreeMap<String, usize>,
 }
 
 pub(crate) struct Ros {
@@ -501,21 +429,6 @@ impl Ros {
         if let Some(socket) = &mut self.socket {
             // A closed connection is detected by the next read.
             socket.send(Message::text(text)).ok();
-        }
-    }
-}
-
-impl Node {
-    /// The command of the arm for the coming period: no motion without a velocity.
-    fn command(&mut self) -> ArmCommand {
-        if self.stopped {
-            self.waiting = None;
-            self.points.clear();
-        }
-        let rates = self.rates.take().or(self.points.pop_front()).filter(|_| !self.stopped);
-        ArmCommand {
-            velocities: rates.unwrap_or_else(|| Joints::from_fn(4, |_| 0.0)),
-            opening: self.opening.clamp(0.0, 1.0),
         }
     }
 }
