@@ -2,7 +2,9 @@
 """How a policy with several arms fails: plays episodes and counts what the arms without success did.
 
 An arm *touched* its object if the object ends more than 2 cm from its start, and is *at* it if its hand ends within
-5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm.
+5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm. The value is what
+the critic expects of such arms after half of the steps, mean over the arms: minus the discounted number of steps until
+success. An arm that waits forever has -1 / (1 - discount).
 """
 
 import argparse
@@ -25,7 +27,7 @@ Needs: pip install ./python
 
 def play(policy, n_envs, seed):
     """Plays an episode in each environment. Returns starts, ends, goals and hands, each [n_envs, n_arms, 3], metres in
-    the arms' frames."""
+    the arms' frames, and the critic's values after half of the steps, [n_envs, n_arms]."""
     envs = gymnasium.make_vec(policy.env_id, num_envs=n_envs)
     n_steps = envs.spec.max_episode_steps
     observation, _ = envs.reset(seed=seed)
@@ -34,12 +36,15 @@ def play(policy, n_envs, seed):
         return values.reshape(n_envs, policy.n_arms, -1)[:, :, :3].copy()
 
     starts = places(observation["achieved_goal"])
-    for _ in range(n_steps):
+    for step in range(n_steps):
         action, _ = policy.predict(observation)
+        if step == n_steps // 2:
+            # A critic with one value for all arms expects the same of each.
+            values = np.broadcast_to(policy.q(observation, action), (n_envs, policy.n_arms))
         observation, *_ = envs.step(action)
     ends, goals = places(observation["achieved_goal"]), places(observation["desired_goal"])
     # The first three numbers of an arm's observation are the place of its hand.
-    return starts, ends, goals, places(observation["observation"])
+    return starts, ends, goals, places(observation["observation"]), values
 
 
 def distances(some, others):
@@ -47,18 +52,22 @@ def distances(some, others):
     return np.linalg.norm(some - others, axis=2)
 
 
-def count(starts, ends, goals, hands, tolerance_m):
+def count(starts, ends, goals, hands, values, tolerance_m):
     """Returns the failed episodes and, of the arms without success, how many touched their objects and are at them."""
     failed = distances(ends, goals) > tolerance_m
     touched, near = distances(starts, ends) > MOVED_M, distances(hands, ends) < NEAR_M
+    waiting = failed & ~touched & ~near
     return {
         "episodes": len(failed),
         "failed episodes": int(failed.any(axis=1).sum()),
         "arms without success": int(failed.sum()),
-        "object not touched, hand away": int((failed & ~touched & ~near).sum()),
+        "object not touched, hand away": int(waiting.sum()),
         "object not touched, hand at it": int((failed & ~touched & near).sum()),
         "object touched, hand away": int((failed & touched & ~near).sum()),
         "object touched, hand at it": int((failed & touched & near).sum()),
+        "value of arms whose object is not touched, hand away": round(float(values[waiting].mean()), 1)
+        if waiting.any()
+        else None,
     }
 
 
@@ -84,7 +93,7 @@ def main():
     if "carry-bar" in policy.task:
         sys.exit("error: carry-bar has one object for both arms: expected a policy for push or pick-and-place")
     for name, value in count(*play(policy, args.episodes, args.seed), tolerance_m=0.05).items():
-        print(f"{value:6}  {name}")
+        print(f"{'–' if value is None else value:>6}  {name}")
 
 
 if __name__ == "__main__":

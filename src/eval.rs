@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::text::counted;
-use tandem_core::work::{EpisodeOrder, RunTerms};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms};
 use tandem_core::{
     AdviceTerms, Episode, EvaluationSummary, Exploration, Layout, TaskSpec, Wilson, WorldSettings,
 };
@@ -180,7 +180,7 @@ fn record(
         number,
         seed,
         advised: false,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: true,
         advised_steps: None,
     };

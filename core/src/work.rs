@@ -21,6 +21,18 @@ pub struct RunTerms {
     pub world: WorldSettings,
 }
 
+/// How a training episode explores.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum EpisodeExploration {
+    /// As the run's [`Exploration`] says.
+    #[default]
+    Noise,
+    /// All actions are uniformly random (warm-up).
+    Uniform,
+    /// Not at all: the policy's actions are executed as they are.
+    Greedy,
+}
+
 /// An episode to play.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EpisodeOrder {
@@ -30,8 +42,8 @@ pub struct EpisodeOrder {
     pub seed: u64,
     /// Whether to ask the teacher for advice.
     pub advised: bool,
-    /// Whether all actions are uniformly random (warm-up).
-    pub uniform: bool,
+    /// How it explores, if it is played for training.
+    pub exploration: EpisodeExploration,
     /// Whether to record the episode in a log.
     pub record: bool,
     /// The number of steps, from the first one on, on which an advised episode asks; `None` means all.

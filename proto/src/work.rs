@@ -4,7 +4,7 @@ mod episode;
 mod parameters;
 
 use tandem_core::task::MAX_ARMS;
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, AdviceUnit, EpisodeKind, Exploration, JudgedAction, Layout, Task, TaskSpec,
     WorldSettings,
@@ -186,22 +186,29 @@ const fn encode_episode_order(order: &EpisodeOrder) -> pb::EpisodeOrder {
         number: order.number,
         seed: order.seed,
         advised: order.advised,
-        uniform: order.uniform,
+        uniform: matches!(order.exploration, EpisodeExploration::Uniform),
         record: order.record,
         advised_steps: order.advised_steps,
+        greedy: matches!(order.exploration, EpisodeExploration::Greedy),
     }
 }
 
-/// Decodes an order. All values of its fields are valid.
-const fn decode_episode_order(order: pb::EpisodeOrder) -> EpisodeOrder {
-    EpisodeOrder {
+fn decode_episode_order(order: pb::EpisodeOrder) -> Result<EpisodeOrder, DecodeError> {
+    if order.uniform && order.greedy {
+        return Err(DecodeError::new("greedy", "false if uniform is true", true));
+    }
+    Ok(EpisodeOrder {
         number: order.number,
         seed: order.seed,
         advised: order.advised,
-        uniform: order.uniform,
+        exploration: match (order.uniform, order.greedy) {
+            (true, _) => EpisodeExploration::Uniform,
+            (_, true) => EpisodeExploration::Greedy,
+            _ => EpisodeExploration::Noise,
+        },
         record: order.record,
         advised_steps: order.advised_steps,
-    }
+    })
 }
 
 /// Encodes a slot.
@@ -218,7 +225,8 @@ pub fn encode_slot(slot: &SlotOrder) -> pb::Slot {
 /// Decodes a slot.
 ///
 /// # Errors
-/// Returns an error if the kind is unknown or the slot does not have 1 to 1024 episodes.
+/// Returns an error if the kind is unknown, the slot does not have 1 to 1024 episodes, or one of them is both uniform
+/// and greedy.
 pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
     if !(1..=MAX_SLOT_EPISODES).contains(&slot.episodes.len()) {
         let expected = format_args!("1 to {MAX_SLOT_EPISODES} episodes").to_string();
@@ -228,7 +236,15 @@ pub fn decode_slot(slot: pb::Slot) -> Result<SlotOrder, DecodeError> {
         slot: slot.slot,
         parameter_version: slot.parameter_version,
         kind: decode_episode_kind(slot.kind)?,
-        episodes: slot.episodes.into_iter().map(decode_episode_order).collect(),
+        episodes: slot
+            .episodes
+            .into_iter()
+            .enumerate()
+            .map(|(idx, order)| {
+                decode_episode_order(order)
+                    .map_err(|error| error.within(format_args!("episodes[{idx}]")))
+            })
+            .collect::<Result<_, _>>()?,
     })
 }
 
@@ -260,11 +276,11 @@ mod tests {
     }
 
     fn slot() -> SlotOrder {
-        let order = |number, advised| EpisodeOrder {
+        let order = |number, advised, exploration| EpisodeOrder {
             number,
             seed: 42,
             advised,
-            uniform: !advised,
+            exploration,
             record: advised,
             advised_steps: advised.then_some(17),
         };
@@ -272,7 +288,11 @@ mod tests {
             slot: 3,
             parameter_version: 9,
             kind: EpisodeKind::Evaluation,
-            episodes: vec![order(64, true), order(65, false)],
+            episodes: vec![
+                order(64, true, EpisodeExploration::Noise),
+                order(65, false, EpisodeExploration::Uniform),
+                order(66, false, EpisodeExploration::Greedy),
+            ],
         }
     }
 
@@ -343,5 +363,9 @@ mod tests {
         check(|s| s.kind = 0, "kind: expected 1 (training) or 2 (evaluation), got 0");
         check(|s| s.kind = 3, "kind: expected 1 (training) or 2 (evaluation), got 3");
         check(|s| s.episodes.clear(), "episodes: expected 1 to 1024 episodes, got 0");
+        check(
+            |s| s.episodes[1].greedy = true,
+            "episodes[1].greedy: expected false if uniform is true, got true",
+        );
     }
 }

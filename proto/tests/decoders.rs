@@ -183,15 +183,16 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
 }
 
 fn slot() -> impl Strategy<Value = pb::Slot> {
-    let flags = (any::<bool>(), any::<bool>(), any::<bool>());
+    let flags = (any::<bool>(), any::<bool>(), any::<bool>(), any::<bool>());
     let order = (any::<u64>(), any::<u64>(), flags, any::<Option<u32>>()).prop_map(
-        |(number, seed, (advised, uniform, record), advised_steps)| pb::EpisodeOrder {
+        |(number, seed, (advised, uniform, record, greedy), advised_steps)| pb::EpisodeOrder {
             number,
             seed,
             advised,
             uniform,
             record,
             advised_steps,
+            greedy,
         },
     );
     let n_episodes = prop_oneof![10 => 0_usize..20, 1 => Just(1024_usize), 1 => Just(1025_usize)];

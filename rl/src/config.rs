@@ -192,6 +192,11 @@ pub struct RoundsConfig {
     pub polyak_every: PolyakEvery,
     /// Number of environment steps with random actions at the start of training.
     pub warmup_env_steps: u64,
+    /// Fraction of the episodes without advice that are played without exploration from three quarters of the run's
+    /// environment steps on, in [0, 1]. From one quarter, it rises linearly from 0 until then. A run without a limit in
+    /// environment steps has none.
+    #[serde(default)]
+    pub final_greedy_share: f64,
     /// Rounds that metrics count as one epoch of the paper, 1 to 1,000,000 (cycles per epoch of the HER reference
     /// implementation: 50). It affects no other result.
     #[serde(default = "cycles_per_epoch")]
@@ -371,6 +376,12 @@ impl RunConfig {
         let horizon = |discount: f32| 1.0 / (1.0 - discount);
         let (first, last) = (horizon(self.ddpg.discount), horizon(self.ddpg.final_discount));
         1.0 - 1.0 / (first + share * (last - first))
+    }
+
+    /// Returns the fraction of the episodes without advice that round `round`, from 0, plays without exploration.
+    #[must_use]
+    pub fn greedy_share(&self, round: u64) -> f64 {
+        self.rounds.final_greedy_share * f64::from(self.share_of_part(round, 0.25, 0.75))
     }
 
     /// Returns the weight of behaviour cloning in round `round`, from 0.

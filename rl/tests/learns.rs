@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use tandem_core::layout::{EPISODE_STEPS, Layout, OBJECT_POSITION};
 use tandem_core::rng::{Stream, episode_rng, standard_normal, uniform};
-use tandem_core::work::EpisodeOrder;
+use tandem_core::work::{EpisodeExploration, EpisodeOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, Task};
 use tandem_policy::Actor;
 use tandem_rl::RunConfig;
@@ -77,7 +77,7 @@ fn success(trainer: &Trainer) -> f64 {
         number,
         seed: 99,
         advised: false,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: false,
         advised_steps: None,
     };

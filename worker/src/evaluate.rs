@@ -6,7 +6,7 @@ mod served;
 use std::num::NonZeroUsize;
 
 use tandem_core::layout::Layout;
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
 use tandem_policy::{Actor, BlindActor};
 use tandem_sim::{Env, WorldConfig};
@@ -174,7 +174,7 @@ fn slot_of(numbers: impl IntoIterator<Item = u64>, seed: u64) -> SlotOrder {
         number,
         seed,
         advised: false,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: false,
         advised_steps: None,
     };

@@ -2,7 +2,7 @@
 
 use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery,
     WorldSettings,
@@ -173,7 +173,7 @@ pub(crate) fn slot(numbers: &[u64], advised: bool) -> SlotOrder {
         number: *number,
         seed: 11,
         advised,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: false,
         advised_steps: None,
     };

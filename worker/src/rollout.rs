@@ -1,7 +1,7 @@
 //! The life of an episode: reset, then act, explore, ask, execute and observe on every step.
 
 use tandem_core::rng::{Stream, episode_rng};
-use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceUnit, Contacts, Episode, EpisodeKind, JudgedAction, StepAdvice, StepQuery, TaskSpec,
     WorldSettings,
@@ -411,7 +411,11 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
         return None;
     }
     let rng = episode_rng(order.seed, order.number, Stream::Exploration);
-    let explorer = if order.uniform { Explorer::uniform } else { Explorer::new };
+    let explorer = match order.exploration {
+        EpisodeExploration::Noise => Explorer::new,
+        EpisodeExploration::Uniform => Explorer::uniform,
+        EpisodeExploration::Greedy => return None,
+    };
     Some(explorer(&terms.layout, terms.exploration, rng))
 }
 

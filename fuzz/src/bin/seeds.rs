@@ -9,7 +9,9 @@ use libfuzzer_sys as _;
 use mcap::records::{MessageHeader, Record};
 use prost::Message as _;
 use tandem_core::task::{ArmDescription, Manipulation, Norm, Reflection};
-use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{
+    EpisodeExploration, EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder,
+};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
     Task, TaskDescription, TaskSpec, WorldSettings,
@@ -162,7 +164,7 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         number: 64,
         seed: 42,
         advised: true,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: true,
         advised_steps: None,
     };

@@ -3,7 +3,7 @@
 mod lock_steps;
 mod model;
 
-use tandem_core::work::EpisodeOrder;
+use tandem_core::work::{EpisodeExploration, EpisodeOrder};
 use tandem_core::{Layout, Task};
 
 use super::*;
@@ -17,7 +17,7 @@ fn order(number: u64, kind: EpisodeKind) -> SlotOrder {
         number,
         seed: 1,
         advised: false,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: false,
         advised_steps: None,
     };

@@ -118,20 +118,22 @@ class Slot(_message.Message):
     def __init__(self, slot: _Optional[int] = ..., parameter_version: _Optional[int] = ..., kind: _Optional[_Union[EpisodeKind, str]] = ..., episodes: _Optional[_Iterable[_Union[EpisodeOrder, _Mapping]]] = ...) -> None: ...
 
 class EpisodeOrder(_message.Message):
-    __slots__ = ("number", "seed", "advised", "uniform", "record", "advised_steps")
+    __slots__ = ("number", "seed", "advised", "uniform", "record", "advised_steps", "greedy")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
     ADVISED_FIELD_NUMBER: _ClassVar[int]
     UNIFORM_FIELD_NUMBER: _ClassVar[int]
     RECORD_FIELD_NUMBER: _ClassVar[int]
     ADVISED_STEPS_FIELD_NUMBER: _ClassVar[int]
+    GREEDY_FIELD_NUMBER: _ClassVar[int]
     number: int
     seed: int
     advised: bool
     uniform: bool
     record: bool
     advised_steps: int
-    def __init__(self, number: _Optional[int] = ..., seed: _Optional[int] = ..., advised: bool = ..., uniform: bool = ..., record: bool = ..., advised_steps: _Optional[int] = ...) -> None: ...
+    greedy: bool
+    def __init__(self, number: _Optional[int] = ..., seed: _Optional[int] = ..., advised: bool = ..., uniform: bool = ..., record: bool = ..., advised_steps: _Optional[int] = ..., greedy: bool = ...) -> None: ...
 
 class Wait(_message.Message):
     __slots__ = ()

@@ -70,6 +70,9 @@ impl RunConfig {
         let updates = rounds.updates_per_env_step;
         let is_rate = (1e-9..=100.0).contains(&updates);
         check("rounds.updates_per_env_step", updates, is_rate, "1e-9 to 100")?;
+        let greedy = rounds.final_greedy_share;
+        let is_share = (0.0..=1.0).contains(&greedy);
+        check("rounds.final_greedy_share", greedy, is_share, "a number in [0, 1]")?;
         let is_epoch = (1..=1_000_000).contains(&rounds.per_epoch);
         check("rounds.per_epoch", rounds.per_epoch, is_epoch, "1 to 1,000,000")
     }

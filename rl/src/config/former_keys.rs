@@ -20,11 +20,12 @@ pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"
 
 /// Settings that earlier versions did not have, and the values that mean what those versions did, as JSON and TOML. A
 /// file with all settings of an earlier version, and a checkpoint, have these values where they have none.
-pub const ADDED: [(&str, &str); 12] = [
+pub const ADDED: [(&str, &str); 13] = [
     ("advice.budget_scope", "\"run\""),
     ("advice.unit", "\"env-step\""),
     ("advice.judged_action", "\"executed\""),
     ("rounds.per_epoch", "50"),
+    ("rounds.final_greedy_share", "0.0"),
     ("exploration.joint_random_actions", "false"),
     ("replay.joint_goal_statistics", "false"),
     ("replay.reflection_prob", "0.0"),

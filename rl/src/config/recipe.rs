@@ -118,6 +118,7 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
             },
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
+            final_greedy_share: 0.0,
             per_epoch: 50,
         },
         Recipe::Paper => RoundsConfig {
@@ -127,6 +128,7 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
             updates_per_env_step: 0.025,
             polyak_every: PolyakEvery::Round,
             warmup_env_steps: 0,
+            final_greedy_share: 0.0,
             per_epoch: 50,
         },
     }

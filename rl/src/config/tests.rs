@@ -108,6 +108,17 @@ fn the_horizon_of_the_discount_grows_over_the_middle_half_of_a_run() {
 }
 
 #[test]
+fn greedy_episodes_get_more_over_the_middle_half_of_a_run() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.stop.max_env_steps = 80_000;
+    config.rounds.final_greedy_share = 0.5;
+    let shares = [0, 25, 50, 75, 100].map(|round| config.greedy_share(round));
+    assert_eq!(shares, [0.0, 0.0, 0.25, 0.5, 0.5], "rounds of 800 steps");
+    config.stop.max_env_steps = 0;
+    assert_eq!(config.greedy_share(50), 0.0, "without an end");
+}
+
+#[test]
 fn a_bad_value_is_named() {
     let check = |change: fn(&mut RunConfig), key| {
         let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
@@ -130,6 +141,7 @@ fn a_bad_value_is_named() {
     check(|config| config.seed = TEST_SEED, "seed is 777: expected another seed");
     check(|config| config.evaluation.seed = TEST_SEED, "evaluation.seed is 777");
     check(|config| config.rounds.per_epoch = 0, "rounds.per_epoch");
+    check(|config| config.rounds.final_greedy_share = f64::NAN, "rounds.final_greedy_share");
     check(|config| config.evaluation.early_points = 101, "evaluation.early_points");
     let too_much = |config: &mut RunConfig| {
         config.advice.budget_scope = BudgetScope::Slot;

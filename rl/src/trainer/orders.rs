@@ -1,7 +1,7 @@
 //! Orders of episodes: those of a round, and those of an evaluation.
 
 use tandem_core::episode::EpisodeKind;
-use tandem_core::work::{EpisodeOrder, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, SlotOrder};
 
 use super::Trainer;
 
@@ -13,19 +13,30 @@ impl Trainer {
     #[must_use]
     pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
         let per_round = self.config.episodes_per_round();
-        let warmup_episodes =
-            self.config.rounds.warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
+        let warmup_env_steps = self.config.rounds.warmup_env_steps;
+        let warmup_episodes = warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
+        let greedy_share = self.config.greedy_share(round);
         let n_rounds_ahead = round.saturating_sub(self.counters.round);
         let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));
         let asks = self.config.advice.asks() && advised_steps != Some(0);
         let orders: Vec<EpisodeOrder> = (round * per_round..(round + 1) * per_round)
-            .map(|number| EpisodeOrder {
-                number,
-                seed: self.config.seed,
-                advised: asks && is_advised(number, self.config.advice.share),
-                uniform: number < warmup_episodes,
-                record: false,
-                advised_steps,
+            .map(|number| {
+                let advised = asks && is_advised(number, self.config.advice.share);
+                let exploration = if number < warmup_episodes {
+                    EpisodeExploration::Uniform
+                } else if !advised && is_greedy(number, greedy_share) {
+                    EpisodeExploration::Greedy
+                } else {
+                    EpisodeExploration::Noise
+                };
+                EpisodeOrder {
+                    number,
+                    seed: self.config.seed,
+                    advised,
+                    exploration,
+                    record: false,
+                    advised_steps,
+                }
             })
             .collect();
         slots(&orders, self.config.rounds.rollouts, EpisodeKind::Training, version)
@@ -39,7 +50,7 @@ impl Trainer {
             number,
             seed: evaluation.seed,
             advised: false,
-            uniform: false,
+            exploration: EpisodeExploration::Noise,
             record: number < evaluation.recorded_episodes,
             advised_steps: None,
         };
@@ -57,6 +68,14 @@ impl Trainer {
 pub(super) fn is_advised(number: u64, share: f64) -> bool {
     let advised_before = |number: u64| (number as f64 * share).floor() as u64;
     advised_before(number + 1) > advised_before(number)
+}
+
+/// Returns true if an episode is among the fraction `share` that are greedy. Multiples of the golden ratio spread them
+/// evenly, whichever episodes are advised.
+#[expect(clippy::cast_precision_loss, reason = "episode numbers stay far below 2^52")]
+pub(super) fn is_greedy(number: u64, share: f64) -> bool {
+    const GOLDEN_RATIO: f64 = 0.618_033_988_749_895;
+    (number as f64 * GOLDEN_RATIO).fract() < share
 }
 
 /// Splits orders into slots of `n_episodes`; the learner's queue numbers them.

@@ -1,6 +1,8 @@
 //! Tests of the learning state.
 
-use tandem_core::work::EpisodeOrder;
+use std::ops::Range;
+
+use tandem_core::work::{EpisodeExploration, EpisodeOrder};
 use tandem_core::{Layout, Task};
 
 use super::*;
@@ -83,4 +85,24 @@ fn intervention_feedback_lowers_the_lowest_value() {
     assert_eq!(config.advice.intervention_cost(), 0.0);
     "rlif:0.2".clone_into(&mut config.advice.strategy);
     assert_eq!((config.advice.intervention_cost(), config.advice.horizon()), (1.0, None));
+}
+
+#[test]
+fn greedy_episodes_are_a_share_of_those_without_advice_and_after_the_warm_up() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    config.ddpg.n_hidden = 4;
+    config.rounds.final_greedy_share = 0.5;
+    config.stop.max_env_steps = 100 * config.env_steps_per_round();
+    let trainer = Trainer::new(config).expect("valid");
+    let count = |rounds: Range<u64>| {
+        let slots = rounds.flat_map(|round| trainer.training_orders(round, 0));
+        let orders: Vec<EpisodeOrder> = slots.flat_map(|slot| slot.episodes).collect();
+        let greedy = |order: &&EpisodeOrder| order.exploration == EpisodeExploration::Greedy;
+        assert!(orders.iter().filter(greedy).all(|order| !order.advised));
+        let n_without_advice = orders.iter().filter(|order| !order.advised).count();
+        orders.iter().filter(greedy).count() as f64 / n_without_advice as f64
+    };
+    assert_eq!(count(0..25), 0.0, "the first quarter of the run");
+    assert!((count(25..75) - 0.25).abs() < 0.02, "the share rises");
+    assert!((count(75..100) - 0.5).abs() < 0.02, "half of them at the end");
 }

@@ -90,7 +90,7 @@ fn one_request_covers_every_advised_episode_and_no_other() {
 fn an_evaluation_executes_the_policy_without_exploration_or_advice() {
     let mut order = slot(&[3], true);
     order.kind = EpisodeKind::Evaluation;
-    order.episodes[0].uniform = true;
+    order.episodes[0].exploration = EpisodeExploration::Uniform;
     let episode = play(&order, FakeActor::Constant(0.1), &mut NoAdvisor).remove(0);
     assert!(episode.actions.iter().all(|component| *component == 0.1));
     assert!(
@@ -100,9 +100,24 @@ fn an_evaluation_executes_the_policy_without_exploration_or_advice() {
 }
 
 #[test]
+fn a_greedy_episode_executes_the_policy_and_is_advised_as_any_other() {
+    let mut order = slot(&[3, 4], true);
+    order.episodes[0].exploration = EpisodeExploration::Greedy;
+    let mut teacher = FakeTeacher::new(|episode, step, _| episode == 3 && step == 7);
+    let episodes = play(&order, FakeActor::Constant(0.1), &mut teacher);
+    for step_idx in 0..50 {
+        let expected = if step_idx == 7 { TEACHER_ACTION } else { [0.1; 3] };
+        for arm in LAYOUT.arms() {
+            assert_eq!(episodes[0].action(step_idx)[LAYOUT.action_of(arm)], expected);
+        }
+    }
+    assert!(episodes[1].actions.iter().any(|component| *component != 0.1), "the other explores");
+}
+
+#[test]
 fn a_warm_up_ignores_the_policy() {
     let mut order = slot(&[3], false);
-    order.episodes[0].uniform = true;
+    order.episodes[0].exploration = EpisodeExploration::Uniform;
     let actions =
         |input| play(&order, FakeActor::Constant(input), &mut NoAdvisor).remove(0).actions;
     assert_eq!(actions(0.1), actions(0.9));

@@ -8,7 +8,7 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use tandem_core::rng::{Stream, episode_rng, uniform};
-use tandem_core::work::{EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
+use tandem_core::work::{EpisodeExploration, EpisodeOrder, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{AdviceTerms, EpisodeKind, Exploration, Layout, Task, WorldSettings};
 use tandem_net::{Router, ServerConfig, ServerConfigError};
 use tandem_proto::pb::environment_server::EnvironmentServer;
@@ -61,7 +61,7 @@ fn order(number: u64, kind: EpisodeKind) -> EpisodeOrder {
         number,
         seed: 21,
         advised: is_training && number != 3,
-        uniform: false,
+        exploration: EpisodeExploration::Noise,
         record: !is_training && number == 1,
         advised_steps: None,
     }

@@ -1,172 +1,24 @@
 //! Replays of recorded episodes of every kind: bit for bit equal, or the first difference is named.
 
+mod damaged;
+mod recording;
+
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 
-use proptest::prelude::{ProptestConfig, any, prop_assert, proptest};
-use serde_json::{Value, json};
+use serde_json::json;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::task::TaskDescription;
-use tandem_core::work::{EpisodeOrder, RunTerms, SlotOrder};
-use tandem_core::{
-    AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, Layout, StepAdvice, StepQuery,
-    Task, TaskSpec, World, WorldSettings,
-};
-use tandem_policy::{Actor, Policy};
-use tandem_sim::{Env, WorldConfig};
+use tandem_core::{Contacts, Layout, Task, TaskSpec, World};
 use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, TransitionRecord, TrialMetadata, TrialOutcome,
-    TrialRecorder, read_episode, recover,
+    TrialRecorder, read_episode,
 };
-use tandem_worker::ports::{AdvisorGone, Simulator};
-use tandem_worker::record::{log_name, metadata_of, record_episode, world_of};
+use tandem_worker::record::world_of;
 use tandem_worker::replay::replay_log;
-use tandem_worker::rollout::play_slot;
-use tandem_worker::{Advisor, ComposedTeachers};
 
-/// Number of episodes per slot.
-const N_TOGETHER: u64 = 2;
-
-/// The purpose, start and exploration of an episode.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Kind {
-    Evaluation,
-    Explored,
-    Uniform,
-    Advised,
-    SpecialStart,
-}
-
-const KINDS: [Kind; 5] =
-    [Kind::Evaluation, Kind::Explored, Kind::Uniform, Kind::Advised, Kind::SpecialStart];
-
-/// Returns the shipped teacher of `task` in the classic world, whose vectors have the same lengths in both worlds.
-fn teacher(task: Task) -> Actor {
-    let classic =
-        task.of_one_arm().in_world(World::Classic).expect("every teacher has a classic task");
-    let name = format!("policies/teacher-{classic}-classic.safetensors");
-    let policy = Policy::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).expect("ships");
-    policy.actor().expect("usable")
-}
-
-/// A teacher that takes over one or both arms on two of three steps.
-struct EagerTeacher(Actor, Layout);
-
-impl EagerTeacher {
-    fn verdict(&mut self, query: &StepQuery) -> StepAdvice {
-        let mut action = query.proposed_action.clone();
-        let mut arms = Vec::new();
-        for arm in self.1.arms() {
-            let mut teacher_action = vec![0.0; self.1.single_arm().n_action()];
-            let observation = &query.observation[self.1.observation_of(arm)];
-            self.0.act(observation, &query.goal[self.1.goal_of(arm)], &mut teacher_action);
-            let overridden = !(query.step as usize + arm.0).is_multiple_of(3);
-            if overridden {
-                action[self.1.action_of(arm)].copy_from_slice(&teacher_action);
-            }
-            arms.push(ArmAdvice {
-                teacher_action,
-                q_teacher: -1.0,
-                q_student: -2.0,
-                importance: 1.0,
-                distance: 0.5,
-                overridden,
-            });
-        }
-        StepAdvice { action, charged: arms.iter().any(|arm| arm.overridden), arms, repeated: false }
-    }
-}
-
-impl Advisor for EagerTeacher {
-    fn advise(&mut self, queries: Vec<StepQuery>) -> Result<Vec<StepAdvice>, AdvisorGone> {
-        Ok(queries.iter().map(|query| self.verdict(query)).collect())
-    }
-}
-
-fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
-    let prob = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
-    RunTerms {
-        run: "replay".to_owned(),
-        layout: layout.into(),
-        account: Some("replay".to_owned()),
-        advice: AdviceTerms::default(),
-        exploration: Exploration {
-            noise_std: 0.2,
-            random_action_prob: 0.3,
-            sticky_random_mean_steps: 4.0,
-            joint_random_actions: false,
-        },
-        world: WorldSettings {
-            grasped_start_prob: prob,
-            substeps,
-            randomization: prob,
-            ..WorldSettings::default()
-        },
-    }
-}
-
-fn slot(kind: Kind) -> SlotOrder {
-    let first = N_TOGETHER * KINDS.iter().position(|other| *other == kind).expect("listed") as u64;
-    let order = |number| EpisodeOrder {
-        number,
-        seed: 31,
-        advised: kind == Kind::Advised,
-        uniform: kind == Kind::Uniform,
-        record: true,
-        advised_steps: None,
-    };
-    let played_for =
-        if kind == Kind::Evaluation { EpisodeKind::Evaluation } else { EpisodeKind::Training };
-    SlotOrder {
-        slot: 0,
-        parameter_version: 3,
-        kind: played_for,
-        episodes: (first..first + N_TOGETHER).map(order).collect(),
-    }
-}
-
-/// Plays a slot of a kind, records it as a worker does and returns the log paths.
-fn record(layout: Layout, kind: Kind, substeps: u32, directory: &Path) -> Vec<PathBuf> {
-    let (terms, slot) = (terms(layout, kind, substeps), slot(kind));
-    let world = Env::new(layout, &WorldConfig { substeps, ..WorldConfig::default() });
-    let mut actor = ComposedTeachers::new(teacher(layout.task), layout);
-    let mut advisor = EagerTeacher(teacher(layout.task), layout);
-    let mut world = Simulator::new(world.expect("in range"));
-    let episodes = play_slot(&mut world, &slot, &terms, &mut actor, &mut advisor).expect("plays");
-    let write = |(order, episode)| {
-        let path = directory.join(log_name(episode));
-        let metadata = metadata_of(order, episode, &terms, String::new());
-        record_episode(&metadata, episode, &path).expect("recorded")
-    };
-    slot.episodes.iter().copied().zip(&episodes).map(write).collect()
-}
-
-/// Records one two-arm pick-and-place episode.
-fn one_log(directory: &Path) -> PathBuf {
-    record(Layout::new(Task::PickAndPlace, 2), Kind::Advised, 10, directory).remove(0)
-}
-
-fn tandem(args: &[&str], paths: &[&Path]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
-    command.args(args).args(paths).output().expect("runs")
-}
-
-fn stdout(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
-
-/// Returns the only line on standard error.
-fn error_line(output: &Output) -> String {
-    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(errors.lines().count(), 1, "{errors}");
-    assert!(errors.starts_with("tandem: "), "{errors}");
-    errors
-}
-
-fn summary(output: &Output) -> Value {
-    serde_json::from_str(stdout(output).lines().last().expect("a line")).expect("JSON")
-}
+use crate::recording::{KINDS, error_line, one_log, record, stdout, summary, tandem};
 
 #[test]
 fn episodes_of_every_kind_replay_bit_for_bit() {
@@ -472,89 +324,4 @@ fn a_changed_action_or_world_changes_the_replay() {
         |log| drop(log.metadata.world.insert("substeps".into(), "9".into())),
         "world.substeps is 9",
     );
-}
-
-/// Checks that a damaged log is refused and that its recovery is a prefix of the original. Returns the recovered
-/// length.
-fn check_damaged(whole: &EpisodeLog, bytes: &[u8], directory: &Path) -> Option<usize> {
-    let (damaged, recovered) = (directory.join("damaged.mcap"), directory.join("recovered.mcap"));
-    fs::write(&damaged, bytes).expect("written");
-    assert!(read_episode(&damaged).is_err(), "{} bytes are accepted as complete", bytes.len());
-    let log = recover(&damaged, &recovered).ok().map(|_| read_episode(&recovered))?;
-    let Ok(log) = log else { return None };
-    assert_eq!(log.metadata, whole.metadata);
-    assert!(log.transitions == whole.transitions[..log.transitions.len()]);
-    assert!(log.last_observation.is_none() || log.last_observation == whole.last_observation);
-    Some(log.transitions.len())
-}
-
-#[test]
-fn a_log_truncated_anywhere_is_recovered_up_to_the_cut() {
-    let keep = tempfile::tempdir().expect("a directory");
-    let path = one_log(keep.path());
-    let (whole, bytes) = (read_episode(&path).expect("whole"), fs::read(&path).expect("readable"));
-    let mut n_before = None;
-    for n_bytes in (0..bytes.len()).step_by(37) {
-        let n_steps = check_damaged(&whole, &bytes[..n_bytes], keep.path());
-        assert!(
-            n_steps >= n_before,
-            "{n_bytes} bytes give {n_steps:?} steps, fewer gave {n_before:?}"
-        );
-        if n_steps > n_before && n_steps > Some(0) {
-            let log = read_episode(&keep.path().join("recovered.mcap")).expect("whole");
-            assert!(replay_log(&log).is_ok(), "{n_bytes} bytes");
-            n_before = n_steps;
-        }
-    }
-    assert_eq!(n_before, Some(EPISODE_STEPS));
-}
-
-#[test]
-fn the_program_refuses_and_recovers_truncated_logs() {
-    let keep = tempfile::tempdir().expect("a directory");
-    let bytes = fs::read(one_log(keep.path())).expect("readable");
-    let (cut, recovered) = (keep.path().join("cut.mcap"), keep.path().join("recovered.mcap"));
-    for n_bytes in [0, 7, 8, 100, 3000, bytes.len() / 2, bytes.len() - 1] {
-        fs::write(&cut, &bytes[..n_bytes]).expect("written");
-        let refused = tandem(&["replay", "--verify"], &[&cut]);
-        assert_eq!(refused.status.code(), Some(65), "{n_bytes} bytes");
-        assert!(error_line(&refused).contains("cut.mcap"));
-        let output = tandem(&["mcap", "recover"], &[&cut, Path::new("--to"), &recovered]);
-        let code = output.status.code();
-        assert_eq!(code, Some(if n_bytes < 8 { 65 } else { 0 }), "{n_bytes} bytes");
-        assert_eq!(recovered.exists(), n_bytes >= 8);
-        if recovered.exists() {
-            let again = tandem(&["replay", "--json"], &[&recovered]);
-            let summary = summary(&again);
-            let is_prefix = summary["equal"] == json!(1);
-            assert_eq!(again.status.code(), Some(if is_prefix { 0 } else { 65 }), "{summary}");
-            assert!(is_prefix == (n_bytes > 3000), "{n_bytes} bytes: {summary}");
-            fs::remove_file(&recovered).expect("there");
-        }
-    }
-    let left: Vec<_> =
-        fs::read_dir(keep.path()).expect("there").flatten().map(|e| e.path()).collect();
-    assert!(left.iter().all(|path| path.extension().is_some_and(|e| e == "mcap")), "{left:?}");
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig { cases: 4, failure_persistence: None, ..ProptestConfig::default() })]
-
-    #[test]
-    fn a_log_with_altered_bytes_is_refused_and_recovered(
-        damages in proptest::collection::vec(
-            proptest::collection::vec((any::<usize>(), 1_u8..=255), 1..4), 150,
-        ),
-    ) {
-        let keep = tempfile::tempdir().expect("a directory");
-        let path = one_log(keep.path());
-        let (whole, bytes) = (read_episode(&path).expect("whole"), fs::read(&path).expect("readable"));
-        for damage in damages {
-            let mut damaged = bytes.clone();
-            for (at, change) in &damage {
-                damaged[at % bytes.len()] ^= change;
-            }
-            prop_assert!(damaged == bytes || check_damaged(&whole, &damaged, keep.path()).is_none_or(|n| n <= EPISODE_STEPS));
-        }
-    }
 }
