@@ -4,7 +4,8 @@ The rules, by subcommand; everything else runs as it is:
 
     train         800 environment steps with small networks and few evaluation goals; a resumed run has 1,600
     learner       the same, in a copy of its run file
-    sweep         the file as it is with --dry-run; then its first task, column, seed and values, with runs of 800 steps
+    sweep         the file as it is with --dry-run; then its first task, column, seed and values, with runs of 800 steps;
+                  another seed if there are finished runs, which were not shortened
     eval          at most 8 episodes; films of 160x100 pixels
     replay        an evaluation that the shortened run did not reach is replaced by its last one
     bench         the replay buffer only; `scale` with 20 idle workers and one round
@@ -68,6 +69,8 @@ def sweep(arguments: list[str]) -> list[str]:
         sweep["strategies"] = sweep["strategies"][-1:]
     for axis in sweep.get("axis", []):
         axis.update({key: values[:1] for key, values in axis.items()})
+    if any(Path(value(arguments, "--out") or f"runs/{path.stem}").glob("*/summary.json")):
+        sweep["seeds"] = [1001]
     sweep["run"] = short_run(sweep.get("run", {}))
     file = Path(tempfile.mkdtemp(), path.name)
     file.write_text(to_toml(sweep))
