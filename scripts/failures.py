@@ -2,9 +2,9 @@
 """How a policy with several arms fails: plays episodes and counts what the arms without success did.
 
 An arm *touched* its object if the object ends more than 2 cm from its start, and is *at* it if its hand ends within
-5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm. The value is what
-the critic expects of such arms after half of the steps, mean over the arms: minus the discounted number of steps until
-success. An arm that waits forever has -1 / (1 - discount).
+5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm. The value is the
+mean of the critic's over these arms after half of the steps: without contacts, minus the discounted number of steps
+until success. The value of waiting forever is -1 / (1 - discount).
 """
 
 import argparse

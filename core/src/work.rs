@@ -22,10 +22,9 @@ pub struct RunTerms {
 }
 
 /// How a training episode explores.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EpisodeExploration {
     /// As the run's [`Exploration`] says.
-    #[default]
     Noise,
     /// All actions are uniformly random (warm-up).
     Uniform,

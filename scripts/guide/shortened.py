@@ -5,7 +5,7 @@ The rules, by subcommand; everything else runs as it is:
     train         800 environment steps with small networks and few evaluation goals; a resumed run has 1,600
     learner       the same, in a copy of its run file
     sweep         the file as it is with --dry-run; then its first task, column, seed and values, with runs of 800 steps;
-                  another seed if there are finished runs, which were not shortened
+                  another seed beside finished runs that were not shortened, which would be refused
     eval          at most 8 episodes; films of 160x100 pixels
     replay        an evaluation that the shortened run did not reach is replaced by its last one
     bench         the replay buffer only; `scale` with 20 idle workers and one round
@@ -69,7 +69,8 @@ def sweep(arguments: list[str]) -> list[str]:
         sweep["strategies"] = sweep["strategies"][-1:]
     for axis in sweep.get("axis", []):
         axis.update({key: values[:1] for key, values in axis.items()})
-    if any(Path(value(arguments, "--out") or f"runs/{path.stem}").glob("*/summary.json")):
+    finished = Path(value(arguments, "--out") or f"runs/{path.stem}").glob("*/summary.json")
+    if any(json.loads(file.read_text())["env_steps"] > ENV_STEPS for file in finished):
         sweep["seeds"] = [1001]
     sweep["run"] = short_run(sweep.get("run", {}))
     file = Path(tempfile.mkdtemp(), path.name)

@@ -11,12 +11,11 @@ use tandem_bridge::{
 };
 use tandem_kinematics::Joints;
 
+use crate::drivers::kinova::{STEADY, Test, assert_stayed, connected};
 use crate::drivers::kinova_side::{Fault, Side};
 use crate::drivers::rig::{
     OWNER, angles, assert_ended, at_rest, eventually, failure, pair_at, sweep,
 };
-
-use crate::drivers::kinova::{STEADY, Test, assert_stayed, connected};
 
 #[test]
 fn repeated_and_late_states_are_not_new() {

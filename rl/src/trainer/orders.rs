@@ -73,7 +73,7 @@ pub(super) fn is_advised(number: u64, share: f64) -> bool {
 /// Returns true if an episode is among the fraction `share` that are greedy. Multiples of the golden ratio spread them
 /// evenly, whichever episodes are advised.
 #[expect(clippy::cast_precision_loss, reason = "episode numbers stay far below 2^52")]
-pub(super) fn is_greedy(number: u64, share: f64) -> bool {
+fn is_greedy(number: u64, share: f64) -> bool {
     const GOLDEN_RATIO: f64 = 0.618_033_988_749_895;
     (number as f64 * GOLDEN_RATIO).fract() < share
 }
