@@ -14,17 +14,20 @@ use crate::matrix::{Matrix, MatrixMut, multiply, transpose};
 
 /// Rows, or columns, of a register tile of the matrix product. A block of a multiple of it wastes no lanes.
 const TILE: usize = 6;
-/// Most tiles of a block. Up to eight tiles, the matrix product reads its operands in place instead of copying them.
+/// Most tiles of a block. Up to `MAX_UNPACKED_TILES`, the matrix product reads its operands in place instead of copying
+/// them.
 const MAX_TILES: usize = 6;
 /// Width from which on a block has at most `MAX_TILES` tiles. In narrower networks, which compute less per row, it has
 /// more.
 const BROAD: usize = 256;
+/// Most tiles of a product that reads its operands in place.
+const MAX_UNPACKED_TILES: usize = 8;
 /// Numbers of a block of elementwise work.
 const ELEMENTWISE_BLOCK: usize = 1 << 15;
 
 /// Returns the most tiles of a block whose rows, or columns, have `width` inputs.
 fn max_tiles(width: usize) -> usize {
-    MAX_TILES * BROAD / width.min(BROAD)
+    (MAX_TILES * BROAD / width.min(BROAD)).min(MAX_UNPACKED_TILES)
 }
 
 /// Splits `0..n` into blocks of about equal size, of at most `max_tiles` tiles each, at multiples of a tile.
