@@ -22,7 +22,9 @@ pub(crate) use bridge::{
     ConnectArgs, DriverName, FaultName, HomeArgs, InjectArgs, MoveArgs, OperatorArgs, ToStartArgs,
 };
 pub(crate) use monitor::{HealthArgs, StatusArgs};
-pub(crate) use policy::{ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs};
+pub(crate) use policy::{
+    ExportArgs, ImportArgs, PolicyArgs, PolicyCommand, ShowArgs, SymmetrizeArgs,
+};
 pub(crate) use recording::{ByteSize, LiveArgs, RecordedName, RecordingArgs};
 pub(crate) use results::{
     EvalArgs, FilmArgs, McapArgs, McapCommand, OutcomeName, PictureArgs, ReplayArgs, ReportArgs,

@@ -160,6 +160,7 @@ fn terms(subject: &EvaluatedPolicy) -> RunTerms {
         advice: AdviceTerms::default(),
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
+        symmetrized_evaluation: false,
     }
 }
 

@@ -1,7 +1,8 @@
-//! `tandem policy`: shows policies, and converts them from and to ONNX.
+//! `tandem policy`: shows policies, symmetrises them, and converts them from and to ONNX.
 
 mod onnx;
 mod show;
+mod symmetrize;
 
 use crate::cli::PolicyCommand;
 use crate::exit::Failed;
@@ -11,5 +12,6 @@ pub(crate) fn policy(command: PolicyCommand) -> Result<(), Failed> {
         PolicyCommand::Show(args) => show::show(&args),
         PolicyCommand::Export(args) => onnx::export(&args),
         PolicyCommand::Import(args) => onnx::import(&args),
+        PolicyCommand::Symmetrize(args) => symmetrize::symmetrize(&args),
     }
 }

@@ -19,6 +19,9 @@ pub struct RunTerms {
     pub exploration: Exploration,
     /// Initial states and physics.
     pub world: WorldSettings,
+    /// Whether the action in evaluation episodes is the mean, before tanh, of the actor's action and of that for the scene
+    /// with the order of its arms reversed.
+    pub symmetrized_evaluation: bool,
 }
 
 /// How a training episode explores.

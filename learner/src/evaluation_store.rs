@@ -63,6 +63,8 @@ pub(crate) struct EvaluationStore {
     out: PathBuf,
     /// The start of the run, seconds since 1970.
     started_s: f64,
+    /// Whether files contain the symmetrised policies.
+    symmetrized: bool,
     history: EvaluationHistory,
     metrics_due: bool,
     events_due: bool,
@@ -72,11 +74,17 @@ pub(crate) struct EvaluationStore {
 
 impl EvaluationStore {
     /// Continues with `history`. All copies in `out` are due, because those there may be of another state. The run
-    /// started at `started_s`, seconds since 1970.
-    pub(crate) fn new(out: &Path, history: EvaluationHistory, started_s: f64) -> Self {
+    /// started at `started_s`, seconds since 1970. `symmetrized` is the run's setting `evaluation.symmetrized`.
+    pub(crate) fn new(
+        out: &Path,
+        history: EvaluationHistory,
+        started_s: f64,
+        symmetrized: bool,
+    ) -> Self {
         Self {
             out: out.to_owned(),
             started_s,
+            symmetrized,
             metrics_due: true,
             events_due: true,
             best_due: history.best.is_some(),
@@ -118,7 +126,9 @@ impl EvaluationStore {
             (&self.history.last, &mut self.last_due, "policy/last.safetensors"),
         ] {
             if let Some(policy) = policy.as_ref().filter(|_| *due) {
-                *due = still_due(write_policy(&self.out.join(name), policy), name, &mut unwritten);
+                let policy = policy.clone();
+                let policy = if self.symmetrized { policy.symmetrized() } else { policy };
+                *due = still_due(write_policy(&self.out.join(name), &policy), name, &mut unwritten);
             }
         }
         unwritten
@@ -212,7 +222,7 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path().join("run");
         std::fs::write(&out, "a file where a directory should be").expect("writes");
-        let mut records = EvaluationStore::new(&out, EvaluationHistory::default(), 0.0);
+        let mut records = EvaluationStore::new(&out, EvaluationHistory::default(), 0.0, false);
         records.add(row(1, true), policy("first"));
         records.add(row(2, false), policy("second"));
         let unwritten: Vec<String> = records.write().into_iter().map(|file| file.what).collect();
@@ -234,15 +244,30 @@ mod tests {
     fn files_of_a_lost_future_are_replaced() {
         let directory = tempfile::tempdir().expect("a directory");
         let out = directory.path();
-        let mut lost = EvaluationStore::new(out, EvaluationHistory::default(), 0.0);
+        let mut lost = EvaluationStore::new(out, EvaluationHistory::default(), 0.0, false);
         lost.add(row(1, true), policy("first"));
         let kept = lost.history().clone();
         lost.add(row(2, true), policy("second"));
         assert!(lost.write().is_empty());
-        assert!(EvaluationStore::new(out, kept, 0.0).write().is_empty());
+        assert!(EvaluationStore::new(out, kept, 0.0, false).write().is_empty());
         assert_eq!(rounds(out), [1]);
         assert_eq!(name_of(&out.join("policy/best.safetensors")), "first");
         assert_eq!(name_of(&out.join("policy/last.safetensors")), "first");
+    }
+
+    #[test]
+    fn files_contain_the_symmetrised_policies_and_the_history_those_that_learn() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let out = directory.path();
+        let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+        config.ddpg.n_hidden = 4;
+        let policy = Trainer::new(config).expect("valid").policy(BTreeMap::new());
+        let mut store = EvaluationStore::new(out, EvaluationHistory::default(), 0.0, true);
+        store.add(row(1, true), policy.clone());
+        assert!(store.write().is_empty());
+        assert_eq!(store.history().best.as_ref(), Some(&policy));
+        let file = Policy::load(&out.join("policy/best.safetensors")).expect("whole");
+        assert_eq!(file.digest(), policy.symmetrized().digest());
     }
 
     #[test]

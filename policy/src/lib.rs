@@ -95,6 +95,7 @@ pub mod normalizer;
 mod packed;
 pub mod policy;
 mod replicate;
+mod symmetrize;
 mod validation;
 
 pub use adam::{Adam, AdamPart, polyak_update};
@@ -110,6 +111,7 @@ pub use mlp::{
 };
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};
 pub use policy::{Policy, actor_digest};
+pub use symmetrize::symmetrized_actor;
 
 /// Tests of the public interface, which name this crate as other crates do.
 #[cfg(test)]

@@ -73,6 +73,7 @@ pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
             substeps: terms.world.substeps,
             randomization: terms.world.randomization,
         }),
+        symmetrized_evaluation: terms.symmetrized_evaluation,
     }
 }
 
@@ -96,6 +97,7 @@ pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
         exploration: decode_exploration(exploration)
             .map_err(|error| error.within("exploration"))?,
         world: decode_world(world).map_err(|error| error.within("world"))?,
+        symmetrized_evaluation: terms.symmetrized_evaluation,
     })
 }
 
@@ -266,6 +268,7 @@ mod tests {
                 sticky_random_mean_steps: 4.0,
                 joint_random_actions: true,
             },
+            symmetrized_evaluation: true,
             world: WorldSettings {
                 grasped_start_prob: 1.0,
                 grasped_start_env_steps: 30_000,

@@ -168,17 +168,20 @@ fn terms() -> impl Strategy<Value = pb::RunTerms> {
         proptest::option::weighted(part, exploration),
         proptest::option::weighted(part, world),
         any_text(),
-        advice.prop_map(Some),
+        (advice.prop_map(Some), any::<bool>()),
     )
-        .prop_map(|(task, n_arms, account, exploration, world, run, advice)| pb::RunTerms {
-            description: None,
-            advice,
-            task,
-            n_arms,
-            account,
-            exploration,
-            world,
-            run,
+        .prop_map(|(task, n_arms, account, exploration, world, run, (advice, symmetrized))| {
+            pb::RunTerms {
+                description: None,
+                advice,
+                symmetrized_evaluation: symmetrized,
+                task,
+                n_arms,
+                account,
+                exploration,
+                world,
+                run,
+            }
         })
 }
 

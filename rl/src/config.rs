@@ -236,6 +236,11 @@ pub struct EvaluationConfig {
     pub recorded_episodes: u64,
     /// Test goals on which the best policy is measured once the run has ended, 1 to 100,000.
     pub test_episodes: u64,
+    /// Whether policies are symmetrised before they are evaluated and saved, if the arms are interchangeable: actor,
+    /// before tanh, and critic become the means of what they compute for a scene and for the scene with its arms in
+    /// reverse order, in networks twice as wide. Training episodes and updates use the networks as they are.
+    #[serde(default)]
+    pub symmetrized: bool,
 }
 
 /// Section `[stop]`: a run ends at the first of these limits; 0 means no limit.

@@ -25,6 +25,8 @@ pub(crate) enum PolicyCommand {
     Export(ExportArgs),
     /// Converts ONNX models to a policy file.
     Import(ImportArgs),
+    /// Makes a policy treat interchangeable arms alike.
+    Symmetrize(SymmetrizeArgs),
 }
 
 #[derive(Debug, Args)]
@@ -86,6 +88,26 @@ pub(crate) struct ImportArgs {
     /// Number of arms [default: as for --task].
     #[arg(long, value_name = "N", requires = "task", value_parser = clap::value_parser!(u8).range(1..=8))]
     pub(crate) arms: Option<u8>,
+    /// Output file.
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub(crate) out: PathBuf,
+    /// Prints one JSON object.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  tandem policy symmetrize runs/a/policy/best.safetensors --out FILE.safetensors
+  tandem eval --policy FILE.safetensors
+
+Where arms are interchangeable, the best action of a scene does not depend on their order. The new \
+policy computes the mean for both orders, in networks twice as wide. Runs save such policies unless \
+evaluation.symmetrized is false.")]
+pub(crate) struct SymmetrizeArgs {
+    /// Policy file.
+    pub(crate) file: PathBuf,
     /// Output file.
     #[arg(long, value_name = "FILE.safetensors")]
     pub(crate) out: PathBuf,

@@ -195,6 +195,7 @@ fn evaluation_terms(layout: impl Into<TaskSpec>) -> RunTerms {
         advice: AdviceTerms::default(),
         exploration: Exploration::NONE,
         world: WorldSettings::default(),
+        symmetrized_evaluation: false,
     }
 }
 

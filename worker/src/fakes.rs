@@ -164,6 +164,7 @@ pub(crate) fn terms() -> RunTerms {
             joint_random_actions: false,
         },
         world: WorldSettings { grasped_start_prob: 0.5, ..WorldSettings::default() },
+        symmetrized_evaluation: false,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery};
-use tandem_policy::{Actor, actor_digest};
+use tandem_policy::{Actor, actor_digest, symmetrized_actor};
 use tandem_proto::environment::{ResetReply, StepReply};
 use tandem_sim::{Env, WorldConfig};
 use tandem_telemetry::events::EpisodeFinished;
@@ -23,6 +23,8 @@ pub(crate) struct Player {
     /// The environments in this process; `None` if a server has them.
     simulator: Option<Simulator>,
     actor: Option<Actor>,
+    /// Whether the actor is the symmetrised one of evaluation episodes.
+    is_symmetrized: bool,
     /// The digest of the actor's parameters; empty without a recorder.
     actor_digest: String,
     recorder: Option<Recorder>,
@@ -58,21 +60,42 @@ impl Player {
         recorder: Option<Recorder>,
         metrics: WorkerMetrics,
     ) -> Self {
-        Self { terms, simulator: None, actor: None, actor_digest: String::new(), recorder, metrics }
+        Self {
+            terms,
+            simulator: None,
+            actor: None,
+            is_symmetrized: false,
+            actor_digest: String::new(),
+            recorder,
+            metrics,
+        }
     }
 
     pub(crate) const fn terms(&self) -> &RunTerms {
         &self.terms
     }
 
-    /// Returns whether the loaded actor has `version`.
-    pub(crate) fn has_version(&self, version: u64) -> bool {
-        self.actor.as_ref().is_some_and(|actor| actor.version() == version)
+    /// Returns whether the loaded actor is the one that plays `order`.
+    pub(crate) fn has_actor_of(&self, order: &SlotOrder) -> bool {
+        let has_version =
+            self.actor.as_ref().is_some_and(|actor| actor.version() == order.parameter_version);
+        has_version && self.is_symmetrized == self.symmetrizes(order.kind)
     }
 
-    /// Loads the actor for the following slots.
-    pub(crate) fn load(&mut self, published: PublishedActor) -> Result<(), tandem_policy::Error> {
+    fn symmetrizes(&self, kind: EpisodeKind) -> bool {
+        self.terms.symmetrized_evaluation && kind == EpisodeKind::Evaluation
+    }
+
+    /// Loads the actor for slots with episodes of `kind`.
+    pub(crate) fn load(
+        &mut self,
+        published: PublishedActor,
+        kind: EpisodeKind,
+    ) -> Result<(), tandem_policy::Error> {
         let layout = &self.terms.layout;
+        self.is_symmetrized = self.symmetrizes(kind);
+        let published =
+            if self.is_symmetrized { symmetrized_actor(layout, &published) } else { published };
         let for_digest = self.recorder.is_some().then(|| published.clone());
         self.actor = Some(Actor::new(layout, published)?);
         self.actor_digest =

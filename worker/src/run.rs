@@ -189,7 +189,7 @@ impl Worker {
         order: SlotOrder,
     ) -> Result<Option<Membership>, Error> {
         let (worker_id, slot) = (member.worker_id, order.slot);
-        if !self.fetch_parameters(&mut member.player, order.parameter_version).await? {
+        if !self.fetch_parameters(&mut member.player, &order).await? {
             tracing::warn!(
                 slot,
                 version = order.parameter_version,
@@ -216,15 +216,22 @@ impl Worker {
     }
 
     /// Loads the parameters of `version` into the player. Returns false if the learner no longer has them.
-    async fn fetch_parameters(&mut self, player: &mut Player, version: u64) -> Result<bool, Error> {
-        if player.has_version(version) {
+    async fn fetch_parameters(
+        &mut self,
+        player: &mut Player,
+        order: &SlotOrder,
+    ) -> Result<bool, Error> {
+        if player.has_actor_of(order) {
             return Ok(true);
         }
+        let version = order.parameter_version;
         let Some(published) = self.learner.parameters(version, &player.terms().layout).await?
         else {
             return Ok(false);
         };
-        player.load(published).map_err(|source| Error::Parameters { version, source })?;
+        player
+            .load(published, order.kind)
+            .map_err(|source| Error::Parameters { version, source })?;
         Ok(true)
     }
 

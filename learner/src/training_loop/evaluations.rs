@@ -35,7 +35,8 @@ impl<'a> Evaluations<'a> {
         pending: Vec<PendingEvaluation>,
         started_s: f64,
     ) -> Self {
-        let store = EvaluationStore::new(&config.out, history, started_s);
+        let symmetrized = config.run.evaluation.symmetrized;
+        let store = EvaluationStore::new(&config.out, history, started_s, symmetrized);
         Self { config, store, pending: pending.into() }
     }
 

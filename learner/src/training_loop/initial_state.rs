@@ -127,6 +127,7 @@ impl<'a> LearnerLoop<'a> {
             advice: config.run.advice.terms(),
             exploration: config.run.exploration,
             world: config.run.world,
+            symmetrized_evaluation: config.run.evaluation.symmetrized,
         };
         shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);

@@ -16,6 +16,10 @@ impl RunConfig {
     pub fn checked(self) -> Result<Self, ConfigError> {
         let layout = self.layout()?;
         self.check_run()?;
+        let symmetrized = self.evaluation.symmetrized;
+        let can_be = layout.has_interchangeable_arms();
+        let expected = "false: the arms of this task are not interchangeable";
+        check("evaluation.symmetrized", symmetrized, !symmetrized || can_be, expected)?;
         self.check_advice(&layout)?;
         self.check_rounds()?;
         self.check_stop()?;

@@ -20,7 +20,7 @@ pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"
 
 /// Settings that earlier versions did not have, and the values that mean what those versions did, as JSON and TOML. A
 /// file with all settings of an earlier version, and a checkpoint, have these values where they have none.
-pub const ADDED: [(&str, &str); 13] = [
+pub const ADDED: [(&str, &str); 14] = [
     ("advice.budget_scope", "\"run\""),
     ("advice.unit", "\"env-step\""),
     ("advice.judged_action", "\"executed\""),
@@ -34,6 +34,7 @@ pub const ADDED: [(&str, &str); 13] = [
     ("ddpg.bc_final_fraction", "1.0"),
     ("ddpg.bc_filter_start", "1.0"),
     ("evaluation.early_points", "0"),
+    ("evaluation.symmetrized", "false"),
 ];
 
 /// Returns the value that a setting had, in effect, before it existed.

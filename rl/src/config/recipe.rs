@@ -87,6 +87,7 @@ impl RunConfig {
                 seed: 240_240,
                 recorded_episodes: 2,
                 test_episodes: 240,
+                symmetrized: tandem && layout.has_interchangeable_arms(),
             },
             stop: stop(recipe, layout),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },

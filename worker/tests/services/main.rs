@@ -7,9 +7,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tandem_core::work::{RunTerms, SlotOrder};
 use tandem_core::{Episode, EpisodeKind};
 use tandem_net::{Backoff, ClientConfig, Pacing};
-use tandem_policy::actor_digest;
+use tandem_policy::{Actor, actor_digest, symmetrized_actor};
 use tandem_telemetry::read_episode;
 use tandem_worker::{Error, RecordedEpisodes, RecordingConfig, Timeouts, WorkerConfig, run_with};
 use tokio_util::sync::CancellationToken;
@@ -154,6 +155,31 @@ async fn a_recorded_episode_gets_a_log_with_its_run_and_policy() {
     assert_eq!(metadata.run, "run-7", "the run's name, not the account's");
     assert_eq!(metadata.policy_digest, actor_digest(&LAYOUT.into(), &actor(2)));
     assert_ne!(metadata.policy_digest, actor_digest(&LAYOUT.into(), &actor(1)));
+}
+
+#[tokio::test]
+async fn evaluation_episodes_alone_are_played_with_the_symmetrised_actor_of_terms_that_say_so() {
+    let expected = episodes_without_faults().await;
+    // A training slot after the evaluation, with the same parameters.
+    let mut orders = orders();
+    orders[1] = SlotOrder { slot: 3, parameter_version: 2, ..orders[1].clone() };
+    orders.swap(1, 2);
+    let terms = RunTerms { symmetrized_evaluation: true, ..terms() };
+    let play = async |terms| {
+        let learner = Arc::new(FakeLearner::new(orders.clone()).with_terms(terms));
+        play_run(&learner, &Arc::new(FakeTeacher::default())).await
+    };
+    let (plain, symmetrised) = (play(support::terms()).await, play(terms).await);
+    assert_eq!(symmetrised[&(false, 2)], plain[&(false, 2)]);
+    assert_eq!(plain[&(true, 0)], expected[&(true, 0)]);
+    let actions = &symmetrised[&(true, 0)].actions;
+    assert_ne!(*actions, expected[&(true, 0)].actions);
+    let published = symmetrized_actor(&LAYOUT.into(), &actor(2));
+    let mut actor = Actor::new(LAYOUT, published).expect("as valid as the actor");
+    let mut first = vec![0.0; LAYOUT.n_action()];
+    let episode = &symmetrised[&(true, 0)];
+    actor.act(&episode.observations[..LAYOUT.n_observation()], &episode.goal, &mut first);
+    assert_eq!(actions[..LAYOUT.n_action()], first);
 }
 
 #[tokio::test]

@@ -36,6 +36,7 @@ pub(crate) fn terms() -> RunTerms {
             joint_random_actions: false,
         },
         world: WorldSettings { substeps: 10, ..WorldSettings::default() },
+        symmetrized_evaluation: false,
     }
 }
 

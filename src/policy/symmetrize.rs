@@ -1,0 +1,32 @@
+//! `tandem policy symmetrize`.
+
+use serde_json::json;
+
+use crate::cli::SymmetrizeArgs;
+use crate::exit::{Failed, OrExit as _};
+use crate::{output, policy_file};
+
+pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
+    let policy = policy_file::load(&args.file)?;
+    let refusal = if policy.is_symmetrized() {
+        Some("is symmetrised already".to_owned())
+    } else if !policy.layout.has_interchangeable_arms() {
+        Some(format!("is for {}, which has no interchangeable arms", policy.layout.name()))
+    } else {
+        None
+    };
+    if let Some(refusal) = refusal {
+        return Err(Failed::usage(format!("{}: {refusal}", args.file.display())));
+    }
+    let policy = policy.symmetrized();
+    policy.save(&args.out).or_cannot_write(String::new)?;
+    let (n_layers, n_hidden) = (policy.n_hidden_layers, policy.n_hidden);
+    if args.json {
+        return output::print(json!({
+            "file": args.out, "digest": policy.digest(), "n_hidden": n_hidden, "n_hidden_layers": n_layers,
+        }));
+    }
+    output::print(format_args!("policy        {}", args.out.display()))?;
+    output::print(format_args!("networks      {n_layers} hidden layers of {n_hidden}"))?;
+    output::print(format_args!("digest        {}", policy.digest()))
+}
