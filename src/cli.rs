@@ -98,7 +98,7 @@ pub(crate) enum Command {
     Status(StatusArgs),
     /// Benchmarks the simulator, networks, updates, replay buffer and a short run on this machine.
     Bench(BenchArgs),
-    /// Inspects policies, and converts them from and to ONNX.
+    /// Inspects and symmetrises policies, and converts them from and to ONNX.
     Policy(PolicyArgs),
     /// Repairs MCAP logs.
     Mcap(McapArgs),

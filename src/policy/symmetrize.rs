@@ -9,9 +9,10 @@ use crate::{output, policy_file};
 pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
     let refusal = if policy.is_symmetrized() {
-        Some("is symmetrised already".to_owned())
+        Some("the policy is symmetrised already".to_owned())
     } else if !policy.layout.has_interchangeable_arms() {
-        Some(format!("is for {}, which has no interchangeable arms", policy.layout.name()))
+        let (task, n_arms) = (policy.layout.name(), policy.layout.n_arms());
+        Some(format!("the arms of {task}, arms {n_arms}, are not interchangeable"))
     } else {
         None
     };

@@ -36,7 +36,7 @@ class JoinResponse(_message.Message):
     def __init__(self, worker_id: _Optional[int] = ..., terms: _Optional[_Union[RunTerms, _Mapping]] = ..., learner: _Optional[int] = ...) -> None: ...
 
 class RunTerms(_message.Message):
-    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run", "description", "advice")
+    __slots__ = ("task", "n_arms", "account", "exploration", "world", "run", "description", "advice", "symmetrized_evaluation")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     ACCOUNT_FIELD_NUMBER: _ClassVar[int]
@@ -45,6 +45,7 @@ class RunTerms(_message.Message):
     RUN_FIELD_NUMBER: _ClassVar[int]
     DESCRIPTION_FIELD_NUMBER: _ClassVar[int]
     ADVICE_FIELD_NUMBER: _ClassVar[int]
+    SYMMETRIZED_EVALUATION_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_arms: int
     account: str
@@ -53,7 +54,8 @@ class RunTerms(_message.Message):
     run: str
     description: _task_pb2.TaskDescription
     advice: AdviceTerms
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ..., description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ..., advice: _Optional[_Union[AdviceTerms, _Mapping]] = ...) -> None: ...
+    symmetrized_evaluation: bool
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., account: _Optional[str] = ..., exploration: _Optional[_Union[Exploration, _Mapping]] = ..., world: _Optional[_Union[WorldTerms, _Mapping]] = ..., run: _Optional[str] = ..., description: _Optional[_Union[_task_pb2.TaskDescription, _Mapping]] = ..., advice: _Optional[_Union[AdviceTerms, _Mapping]] = ..., symmetrized_evaluation: bool = ...) -> None: ...
 
 class AdviceTerms(_message.Message):
     __slots__ = ("judges_policy_action", "charges_slot_steps")
