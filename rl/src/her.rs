@@ -58,7 +58,10 @@ pub struct Sampler {
     layout: TaskSpec,
     contact_cost: f32,
     intervention_cost: f32,
+    /// The transition that is being sampled, or written.
     sample: Relabelled,
+    /// Those of a batch.
+    samples: Vec<Relabelled>,
     raw_observation: Vec<f32>,
     raw_goal: Vec<f32>,
 }
@@ -85,6 +88,7 @@ impl Sampler {
             config: config.clone(),
             layout,
             sample,
+            samples: Vec::new(),
             raw_observation,
             raw_goal,
         }
@@ -118,8 +122,15 @@ impl Sampler {
     ) {
         let n_input = self.layout.n_observation() + self.layout.n_goal();
         let (n_action, n_heads) = (self.layout.n_action(), self.sample.rewards.len());
-        for row in 0..batch.rewards.len() / n_heads {
+        let n_rows = batch.rewards.len() / n_heads;
+        self.samples.resize_with(n_rows, || self.sample.clone());
+        for row in 0..n_rows {
             self.sample_transition(buffer, rng);
+            std::mem::swap(&mut self.sample, &mut self.samples[row]);
+        }
+        self.load(buffer);
+        for row in 0..n_rows {
+            std::mem::swap(&mut self.sample, &mut self.samples[row]);
             let row_of = |n: usize| row * n..(row + 1) * n;
             self.write_input(buffer, 0, statistics, &mut batch.inputs[row_of(n_input)]);
             self.write_input(buffer, 1, statistics, &mut batch.next_inputs[row_of(n_input)]);
@@ -138,6 +149,21 @@ impl Sampler {
                 batch.rewards[row_of(n_heads)].reverse();
             }
         }
+    }
+
+    /// Reads the observations of all sampled transitions into the caches. A buffer is larger than the caches, and
+    /// processors wait for many independent reads at once, but for few at a time while rows are copied one by one.
+    fn load(&self, buffer: &ReplayBuffer) {
+        /// Numbers of a cache line.
+        const LINE: usize = 16;
+        let mut read = 0.0;
+        for StepIndex { episode_idx, step_idx } in self.samples.iter().flat_map(|s| &s.steps) {
+            for later in 0..2 {
+                let observation = buffer.observation(*episode_idx, step_idx + later);
+                read += observation.iter().step_by(LINE).sum::<f32>();
+            }
+        }
+        std::hint::black_box(read);
     }
 
     fn sample_transition(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
