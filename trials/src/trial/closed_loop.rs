@@ -22,7 +22,7 @@ mod episodes;
 mod yielding;
 
 /// Share of the tolerance of its goal within which an object counts as placed.
-const DONE_SHARE: f64 = 0.6;
+const DONE_SHARE: f64 = 0.9;
 /// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
 const STILL_M: f64 = 5e-4;
 const STILL_OPENING: f64 = 0.005;
@@ -258,9 +258,9 @@ impl TrialRunner {
             Err(FailureCause::Refused(_)) => return Ok(false),
             played => played?,
         };
-        state.at = ends;
-        state.openings_m.clone_from(&wanted.openings_m);
         if is_whole {
+            state.at = ends;
+            state.openings_m.clone_from(&wanted.openings_m);
             state.append_waypoints(waypoints);
         } else {
             self.yielded(rig, state, first);

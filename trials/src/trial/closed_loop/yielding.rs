@@ -15,15 +15,23 @@ use crate::trial::runner::TrialRunner;
 /// The force from which a hand withdraws, newtons, and the distance by which it does, metres.
 const PRESSING_N: f64 = 3.0;
 const WITHDRAW_M: f64 = 0.006;
+/// By how much a gripper that holds something is further open than commanded, metres on each side.
+const GRIPPED_M: f64 = 0.002;
 
 impl TrialRunner {
     /// Continues from where the arms stopped on their way from `first`.
     pub(super) fn yielded(&self, rig: &TrialRig<'_>, state: &mut LoopState, first: Waypoint) {
+        let forces_n = rig.forces_n();
         for (arm, (angles, opening)) in rig.encoders().into_iter().enumerate() {
             state.at[arm] = angles;
-            state.openings_m[arm] = self.mapping.opening_in_own(opening);
+            let opening_m = self.mapping.opening_in_own(opening);
+            // A gripper that holds something keeps its grip, unless its hand presses on something.
+            let grips = state.openings_m[arm] < opening_m - GRIPPED_M;
+            if !grips || forces_n[arm].length() >= PRESSING_N {
+                state.openings_m[arm] = opening_m;
+            }
         }
-        let withdraw = rig.forces_n().into_iter().enumerate().map(|(arm, force_n)| {
+        let withdraw = forces_n.into_iter().enumerate().map(|(arm, force_n)| {
             if force_n.length() < PRESSING_N {
                 return DVec3::ZERO;
             }
