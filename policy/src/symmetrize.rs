@@ -137,6 +137,7 @@ fn symmetrized(
 
 /// Returns the parameters of a network that computes what `parameters` compute for the `inputs`, output `outputs[i]` in
 /// place `i`.
+#[expect(clippy::cast_possible_truncation, reason = "parameters are in single precision")]
 fn with_ends(
     shape: &MlpShape,
     parameters: &[f32],

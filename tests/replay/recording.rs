@@ -78,6 +78,7 @@ impl Advisor for EagerTeacher {
 pub(crate) fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
     let prob = if kind == Kind::SpecialStart { 1.0 } else { 0.3 };
     RunTerms {
+        symmetrized_evaluation: false,
         run: "replay".to_owned(),
         layout: layout.into(),
         account: Some("replay".to_owned()),

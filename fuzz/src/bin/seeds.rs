@@ -148,6 +148,7 @@ fn small_log(log: &[u8], compression: Option<mcap::Compression>) -> Result<Vec<u
 
 fn write_messages(to: &Path) -> Result<(), AnyError> {
     let terms = RunTerms {
+        symmetrized_evaluation: true,
         run: "run-7".to_owned(),
         layout: LAYOUT.into(),
         account: Some("run-7".to_owned()),
