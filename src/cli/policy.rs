@@ -11,7 +11,7 @@ use super::{TaskName, WorldName};
 Examples:
   tandem policy show policies/student-push.safetensors
   tandem policy export policies/student-push.safetensors --onnx actor.onnx
-  tandem policy symmetrize policies/student-push.safetensors --out FILE.safetensors
+  tandem policy symmetrize policies/student-push.safetensors --out s.safetensors
   tandem policy import actor.onnx --critic critic.onnx --out FILE.safetensors")]
 pub(crate) struct PolicyArgs {
     #[command(subcommand)]
@@ -100,7 +100,7 @@ pub(crate) struct ImportArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem policy symmetrize policies/student-push.safetensors --out FILE.safetensors
+  tandem policy symmetrize policies/student-push.safetensors --out s.safetensors
   tandem eval --policy FILE.safetensors
 
 Where arms are interchangeable, the best action of a scene does not depend on their order. The new \

@@ -190,6 +190,7 @@ fn the_file_of_an_earlier_version_is_completed_for_comparisons() {
     let mut expected = config.clone();
     expected.replay.reflection_prob = 0.0;
     expected.evaluation.early_points = 0;
+    expected.evaluation.symmetrized = false;
     let completed = completed(&former.to_string()).expect("valid");
     assert_eq!(completed, to_toml(&expected).expect("writes"));
     assert_eq!(self::completed("arms = 0"), None);
