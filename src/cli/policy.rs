@@ -101,7 +101,7 @@ pub(crate) struct ImportArgs {
 #[command(after_help = "\
 Examples:
   tandem policy symmetrize policies/student-push.safetensors --out s.safetensors
-  tandem eval --policy FILE.safetensors
+  tandem eval --policy s.safetensors
 
 Where arms are interchangeable, the best action of a scene does not depend on their order. The new \
 policy computes the mean for both orders, in networks twice as wide. Runs save such policies unless \

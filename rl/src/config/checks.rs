@@ -16,10 +16,7 @@ impl RunConfig {
     pub fn checked(self) -> Result<Self, ConfigError> {
         let layout = self.layout()?;
         self.check_run()?;
-        let symmetrized = self.evaluation.symmetrized;
-        let can_be = layout.has_interchangeable_arms();
-        let expected = "false: the arms of this task are not interchangeable";
-        check("evaluation.symmetrized", symmetrized, !symmetrized || can_be, expected)?;
+        self.check_symmetrized(&layout)?;
         self.check_advice(&layout)?;
         self.check_rounds()?;
         self.check_stop()?;
@@ -52,6 +49,13 @@ impl RunConfig {
         let every_rounds = self.checkpoint.every_rounds;
         check("checkpoint.every_rounds", every_rounds, every_rounds > 0, "at least 1")?;
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
+    }
+
+    fn check_symmetrized(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
+        let symmetrized = self.evaluation.symmetrized;
+        let is_usable = !symmetrized || layout.has_interchangeable_arms();
+        let expected = "false: the arms of this task are not interchangeable";
+        check("evaluation.symmetrized", symmetrized, is_usable, expected)
     }
 
     fn check_advice(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
