@@ -24,6 +24,9 @@ pub enum Recipe {
 /// Environment steps of the paper's epoch: 50 rounds of 32 episodes of 50 steps (decision 005).
 const PAPER_EPOCH_ENV_STEPS: u64 = 80_000;
 
+/// Width of the hidden layers in both recipes.
+const N_HIDDEN: usize = 256;
+
 impl RunConfig {
     /// Returns the recipe's settings for a built-in task and a number of arms.
     ///
@@ -78,7 +81,7 @@ impl RunConfig {
             },
             world: world(recipe, layout),
             replay: replay(recipe, layout),
-            ddpg: ddpg(recipe, n_arms),
+            ddpg: ddpg(recipe, layout),
             evaluation: EvaluationConfig {
                 // The paper evaluates once per epoch.
                 every_env_steps: if tandem { 20_000 } else { PAPER_EPOCH_ENV_STEPS },
@@ -99,9 +102,8 @@ impl RunConfig {
     /// strategy [`INIT_TEACHER`](super::INIT_TEACHER) requires this size.
     #[must_use]
     pub fn sized_for_copies(mut self) -> Self {
-        let teacher = ddpg(self.recipe, 1);
-        self.ddpg.n_hidden = teacher.n_hidden * self.arms;
-        self.ddpg.n_hidden_layers = teacher.n_hidden_layers;
+        self.ddpg.n_hidden = N_HIDDEN * self.arms;
+        self.ddpg.n_hidden_layers = n_hidden_layers(1);
         self
     }
 }
@@ -119,7 +121,7 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
             },
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
-            final_greedy_share: 0.0,
+            final_greedy_share: if carries_past_others(layout) { 0.5 } else { 0.0 },
             per_epoch: 50,
         },
         Recipe::Paper => RoundsConfig {
@@ -138,6 +140,13 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
 /// Returns whether the task is a built-in one of the world `shared`.
 fn is_shared(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
+}
+
+/// Returns whether arms carry objects through an area that they share, each its own. An arm whose way is blocked then
+/// has to wait until the other has made room (decisions 041 and 042).
+fn carries_past_others(layout: &TaskSpec) -> bool {
+    let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
+    is_shared(layout) && grasps && layout.n_arms() > 1
 }
 
 /// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
@@ -221,15 +230,20 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
     }
 }
 
-fn ddpg(recipe: Recipe, n_arms: usize) -> DdpgConfig {
-    let tandem = recipe == Recipe::Tandem;
+fn ddpg(recipe: Recipe, layout: &TaskSpec) -> DdpgConfig {
+    let (tandem, n_arms) = (recipe == Recipe::Tandem, layout.n_arms());
     DdpgConfig {
-        n_hidden: 256,
-        n_hidden_layers: if n_arms == 1 { 3 } else { 4 },
+        n_hidden: N_HIDDEN,
+        n_hidden_layers: n_hidden_layers(n_arms),
         discount: if tandem { 0.95 } else { 0.98 },
+        final_discount: if tandem && carries_past_others(layout) { 0.98 } else { 0.0 },
         action_penalty: if tandem { 0.1 } else { 1.0 },
         bc_weight: if tandem && n_arms > 1 { 2.0 } else { 0.0 },
         cooldown_share: if tandem { 0.2 } else { 0.0 },
         ..DdpgConfig::default()
     }
+}
+
+fn n_hidden_layers(n_arms: usize) -> usize {
+    if n_arms == 1 { 3 } else { 4 }
 }
