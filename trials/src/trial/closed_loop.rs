@@ -19,6 +19,7 @@ use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 mod episodes;
+mod sparing;
 mod yielding;
 
 /// Share of the tolerance of its goal within which an object counts as placed.
@@ -153,6 +154,7 @@ impl TrialRunner {
             wanted.hands.push(hand);
             wanted.openings_m.push(opening_m);
         }
+        self.spare_objects(state, &now, &mut wanted);
         self.keep_parked(state, &mut wanted);
         self.move_hands(rig, state, &wanted)
     }
