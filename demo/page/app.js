@@ -1,6 +1,6 @@
 // The page: plays the student, lets a visitor move the goals, and plays logs that were simulated again.
 
-import { Refused, Simulator } from "./simulator.js";
+import { decompressed, Refused, Simulator } from "./simulator.js";
 import { Screen } from "./screen.js";
 
 const STEP_CM = 1;
@@ -31,9 +31,9 @@ class App {
   async choose(task) {
     this.isReady = false;
     show(badge, "Loading", "");
-    const response = await fetch(`student-${task}.safetensors`);
+    const response = await fetch(`student-${task}.safetensors.gz`);
     if (!response.ok) throw new Error(`the policy: ${response.status} ${response.statusText}`);
-    this.policy = new Uint8Array(await response.arrayBuffer());
+    this.policy = new Uint8Array(await decompressed(await response.blob()));
     this.task = task;
     this.load();
     $("digests").hidden = $("digest-verdict").hidden = true;

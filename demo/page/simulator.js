@@ -47,7 +47,7 @@ export class Simulator {
 }
 
 /** Decompresses a file, unless the server has declared the compression and the browser has undone it. */
-async function decompressed(blob) {
+export async function decompressed(blob) {
   const [first, second] = new Uint8Array(await blob.slice(0, 2).arrayBuffer());
   const isCompressed = first === 0x1f && second === 0x8b;
   const stream = isCompressed ? blob.stream().pipeThrough(new DecompressionStream("gzip")) : blob.stream();
