@@ -1,7 +1,7 @@
-//! Steps that arms do not take as a policy that grasps wants them, so that objects stay where a hand can grasp them.
+//! Changes to the steps of a policy that grasps, which keep objects where a hand can grasp them.
 //!
-//! The training world's hand closes its gripper while it moves, and most often has its object between the pads before they
-//! touch it. An arm closes its gripper after each step, and with a miss pads close on top of the object, or push it ahead.
+//! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
+//! end on the edge of their object, and a hand that misses its object pushes it ahead.
 
 use glam::DVec3;
 
