@@ -145,8 +145,12 @@ fn is_shared(layout: &TaskSpec) -> bool {
 /// Returns whether arms carry objects through an area that they share, each its own. An arm whose way is blocked then
 /// has to wait until the other has made room (decisions 041 and 042).
 fn carries_past_others(layout: &TaskSpec) -> bool {
-    let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
-    is_shared(layout) && grasps && layout.n_arms() > 1
+    is_shared(layout) && grasps(layout) && layout.n_arms() > 1
+}
+
+/// Returns whether the task is a built-in one in which arms grasp objects.
+fn grasps(layout: &TaskSpec) -> bool {
+    layout.as_built_in().is_some_and(|layout| layout.task.grasps())
 }
 
 /// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
@@ -169,9 +173,8 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
 }
 
 fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
-    let grasps = layout.as_built_in().is_some_and(|layout| layout.task.grasps());
     let tandem = recipe == Recipe::Tandem;
-    let starts_grasped = tandem && grasps;
+    let starts_grasped = tandem && grasps(layout);
     let shares_object = layout.shares_object();
     WorldSettings {
         grasped_start_prob: match starts_grasped {

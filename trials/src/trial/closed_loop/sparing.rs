@@ -9,11 +9,11 @@ use super::{LoopState, WantedStep};
 use crate::trial::mapping::ArmObservation;
 use crate::trial::runner::TrialRunner;
 
-/// Height of the point between the pads above an object's centre, metres, at which the pads are beside the object.
+/// The point between the pads is at most this far above an object's centre when the pads are beside the object, metres.
 const BESIDE_M: f64 = 0.015;
 /// Horizontal distance from a hand to an object that it may be about to grasp, metres.
 const NEAR_M: f64 = 0.08;
-/// Horizontal distance between a hand and an object that is between the pads, metres.
+/// An object within this horizontal distance of a hand is between its pads, metres.
 const BETWEEN_M: f64 = 0.012;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
 const AHEAD_M: f64 = 0.045;
@@ -66,8 +66,8 @@ impl TrialRunner {
     }
 }
 
-/// Returns whether a hand that moves `to` (own frame, metres) descends to its object, with its pads still higher than
-/// beside it.
+/// Returns whether a hand that moves `to` (own frame, metres) descends to its object and ends with its pads higher than
+/// [`BESIDE_M`] above the object's centre.
 fn descends_to_object(now: &ArmObservation, to: DVec3) -> bool {
     to.z < now.hand.z
         && to.z > now.object.z + BESIDE_M
