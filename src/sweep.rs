@@ -35,8 +35,8 @@ use sweep_file::{PlannedRun, PlannedSweep};
 
 /// Time between two updates of the live lines and of the dashboard.
 const REFRESH_EVERY: Duration = Duration::from_millis(500);
-/// Time that pages have to receive the end of the sweep.
-const FAREWELL: Duration = Duration::from_millis(500);
+/// Time that pages have to receive the end of the sweep, and then to fetch the documents that changed with it.
+const FAREWELL: Duration = Duration::from_secs(2);
 /// Maximum number of rejected runs that an error names.
 const MAX_NAMED: usize = 3;
 

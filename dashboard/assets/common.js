@@ -137,15 +137,16 @@ export class Documents {
     this.versions = {};
   }
 
-  /** Calls `show` with a document if its version is new. */
+  /** Calls `show` with a document if its version is new. A response that comes after a later one is dropped. */
   async update(name, version, show) {
     if (this.versions[name] === version) return;
     const former = this.versions[name];
     this.versions[name] = version;
     try {
-      show(await fetchJson(`/data/${name}`));
+      const found = await fetchJson(`/data/${name}`);
+      if (this.versions[name] === version) show(found);
     } catch {
-      this.versions[name] = former;
+      if (this.versions[name] === version) this.versions[name] = former;
     }
   }
 }
