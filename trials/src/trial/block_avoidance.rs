@@ -1,9 +1,10 @@
 //! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
 //! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
-//! envelope stops it. A hand above a block's top therefore moves sideways first, and stays just above a block that its
-//! pads would touch. A hand beside a block moves down first and then sideways, because pads that descend along a
-//! block's side press it onto the table. A hand that holds a block lowers it to the table and no further.
+//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, a little higher if
+//! its pads would graze the block, and stays just above a block that its pads would touch. A hand beside a block moves
+//! down first and then sideways, because pads that descend along a block's side press it onto the table. A hand that
+//! holds a block lowers it to the table and no further.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -14,6 +15,8 @@ const BESIDE_M: f64 = 0.003;
 const ABOVE_M: f64 = 0.004;
 /// Closed pads hold a block whose centre is horizontally within this distance, metres.
 const HELD_WITHIN_M: f64 = 0.025;
+/// The number of parts of a step at whose ends pads are compared with a block.
+const N_PARTS: u32 = 8;
 /// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
 const SET_DOWN_M: f64 = 0.002;
 
@@ -56,19 +59,24 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
     }
     let mut is_above = false;
     let mut lowest_m = f64::NEG_INFINITY;
-    for (before, after) in from.each().into_iter().zip(to.each()) {
-        for block in blocks.iter().filter(|block| before.is_above(block)) {
+    let mut lift_m = 0.0_f64;
+    for block in blocks.iter().filter(|block| from.crosses(&to, block)) {
+        let over_m = block.top_m() + ABOVE_M;
+        let pads = from.each().into_iter().zip(to.each());
+        for (before, after) in pads.filter(|(before, _)| before.is_above(block)) {
             is_above = true;
+            lift_m = lift_m.max(over_m - before.lowest_m());
             if after.overlaps(block) {
-                lowest_m = lowest_m.max(block.top_m() + ABOVE_M + end.z - after.lowest_m());
+                lowest_m = lowest_m.max(over_m + end.z - after.lowest_m());
             }
         }
     }
     if !is_above {
         return [start.with_z(end.z), end];
     }
-    let end = end.with_z(end.z.max(lowest_m.min(start.z)));
-    [end.with_z(start.z), end]
+    let highest_m = start.z + lift_m;
+    let end = end.with_z(end.z.max(lowest_m.min(highest_m)));
+    [end.with_z(highest_m), end]
 }
 
 impl ObservedBlock {
@@ -90,6 +98,17 @@ impl Pads {
         self.opening_m <= block.half_m.y
             && offset.truncate().length() < HELD_WITHIN_M + longer_m
             && offset.z.abs() < block.half_m.z
+    }
+
+    /// Returns whether a pad, or what is between the pads, overlaps `block`, seen from above, on the way to `to`.
+    fn crosses(&self, to: &Self, block: &ObservedBlock) -> bool {
+        (0..=N_PARTS).any(|part| {
+            let share = f64::from(part) / f64::from(N_PARTS);
+            let centre = self.centre.lerp(to.centre, share);
+            let between = Pad { centre, axes: to.axes };
+            let [one, other] = Self { centre, ..*to }.each();
+            [one, between, other].iter().any(|pad| pad.overlaps(block))
+        })
     }
 
     /// Each of the two pads.
@@ -195,6 +214,27 @@ mod tests {
         let lower = tilted(end).each().map(|pad| pad.lowest_m());
         assert!(lower[0] < lower[1] - 0.03, "{lower:?}");
         assert!((lower[0] - (0.056 + ABOVE_M)).abs() < 1e-12, "{lower:?}");
+    }
+
+    #[test]
+    fn pads_that_would_graze_a_block_cross_it_higher() {
+        let grazing = 0.056 + PAD_HALF_M.z - 0.001;
+        let from = DVec3::new(0.04, 0.0, grazing);
+        let [corner, end] =
+            avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.16, 0.0, 0.03), 0.0), &[BLOCK]);
+        assert!((corner.z - (grazing + 0.005)).abs() < 1e-12, "{corner}");
+        assert_eq!(end, DVec3::new(0.16, 0.0, 0.03));
+    }
+
+    #[test]
+    fn a_block_that_a_hand_does_not_cross_does_not_change_its_path() {
+        let far = ObservedBlock { at: BLOCK.at + DVec3::Y * 0.3, ..BLOCK };
+        let high = ObservedBlock { half_m: DVec3::splat(0.04), at: BLOCK.at.with_z(0.04), ..BLOCK };
+        let from = DVec3::new(0.03, 0.0, 0.072);
+        let path = |blocks: &[ObservedBlock]| {
+            avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.08, 0.0, 0.03), 0.0), blocks)
+        };
+        assert_eq!(path(&[high, far])[0], from.with_z(0.03), "beside one block, above another");
     }
 
     #[test]

@@ -20,6 +20,7 @@ use crate::trial::shared_object::keep_distance;
 
 mod episodes;
 mod sparing;
+mod squeezing;
 mod yielding;
 
 /// Share of the tolerance of its goal within which an object counts as placed.
@@ -92,8 +93,10 @@ struct LoopState {
     carries: bool,
     /// By how much each hand is to withdraw from what it presses on, own frames, metres.
     withdraw: Option<Vec<DVec3>>,
-    /// The arms that have placed their objects and stay out of the other arm's way.
+    /// The arms that stay out of the other arm's way: their objects are at their goals, or they wait for their turn.
     parked: Vec<bool>,
+    /// The number of times that an arm has waited for its turn.
+    n_waits: usize,
     /// The generator of the noise in the actions, after the first episode.
     noise: Option<ChaCha8Rng>,
     /// The waypoints of the tools so far.
@@ -254,7 +257,7 @@ impl TrialRunner {
         let played = if state.carries {
             rig.play(motion, self.config.speed).map(|()| true)
         } else {
-            rig.play_yielding(motion, self.config.speed)
+            rig.play_yielding(motion, self.config.speed * self.step_speed(state, wanted, to))
         };
         let is_whole = match played {
             Err(FailureCause::Refused(_)) => return Ok(false),
@@ -315,14 +318,16 @@ impl TrialRunner {
         ways.into_iter().map(|(_, to)| to).collect()
     }
 
+    /// Returns the points between the pads of end effectors at `hands` (own frames, metres), world frame, metres.
+    fn pads_of(&self, hands: &[DVec3]) -> Vec<DVec3> {
+        let hands = hands.iter().enumerate();
+        hands.map(|(arm, own)| self.mapping.pads_in_world(ArmIndex(arm), *own)).collect()
+    }
+
     /// Moves the end effectors `to` so that they are as far apart as `from`; own frames, metres.
     fn keep_hands_apart(&self, from: &[DVec3], to: &mut [DVec3]) {
-        let in_world = |own: &[DVec3]| -> Vec<DVec3> {
-            let pads = own.iter().enumerate();
-            pads.map(|(arm, own)| self.mapping.pads_in_world(ArmIndex(arm), *own)).collect()
-        };
-        let mut pads = in_world(to);
-        keep_distance(&in_world(from), &mut pads);
+        let mut pads = self.pads_of(to);
+        keep_distance(&self.pads_of(from), &mut pads);
         for (arm, (to, pads)) in to.iter_mut().zip(pads).enumerate() {
             *to = self.mapping.hand_of_pads(ArmIndex(arm), pads);
         }
@@ -392,6 +397,7 @@ impl LoopState {
             carries: false,
             withdraw: None,
             parked: vec![false; at.len()],
+            n_waits: 0,
             noise: None,
             waypoints: Vec::new(),
         }

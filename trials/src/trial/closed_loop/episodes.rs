@@ -1,7 +1,8 @@
 //! Episodes of a trial in the closed loop.
 //!
 //! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
-//! with. Its actions then have noise: a policy without noise would fail in the same way again.
+//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms that block each other
+//! take turns.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
@@ -18,12 +19,21 @@ use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
 /// A policy is done after this many consecutive observations of placed objects that stay there.
 const DONE_OBSERVATIONS: usize = 5;
-/// The number of consecutive steps that the arms do not carry out in full, after which an arm retreats.
+/// By this many the steps that the arms do not carry out in full exceed the others when an arm makes way.
 const MAX_BLOCKED: usize = 10;
 /// Height above the table, metres, below which an object lies on it.
 const LYING_M: f64 = 0.01;
 /// Height by which a hand rises before it withdraws, metres.
 const RISE_M: f64 = 0.06;
+
+/// What follows a step when arms block each other or an arm waits.
+#[derive(Debug, PartialEq)]
+enum Turn {
+    Same,
+    /// These arms retreat and stay out of the way, and the others go on.
+    Parks(Vec<bool>),
+    NextEpisode,
+}
 
 impl TrialRunner {
     /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
@@ -61,7 +71,7 @@ impl TrialRunner {
         execution: &mut TrialExecution,
     ) -> Result<(), FailureCause> {
         let time_limit_s = self.config.time_limit_s / self.config.speed;
-        let (mut n_in_episode, mut n_blocked) = (0, 0);
+        let (mut n_in_episode, mut n_blocked) = (0, 0_usize);
         loop {
             if state.n_done == DONE_OBSERVATIONS {
                 rig.wait(REST_S)?;
@@ -85,22 +95,63 @@ impl TrialRunner {
             // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
             if self.step(rig, start, state, policy)? {
                 n_in_episode += 1;
-                n_blocked = 0;
+                n_blocked = n_blocked.saturating_sub(1);
             } else {
                 execution.n_shortened += 1;
                 n_blocked += 1;
             }
-            if n_blocked == MAX_BLOCKED && !self.task.shares_object() {
+            if self.task.shares_object() {
+                continue;
+            }
+            let is_blocked = n_blocked == MAX_BLOCKED;
+            if is_blocked {
                 n_blocked = 0;
-                let parks = self.parking(rig, start, state)?;
-                if parks.contains(&true) {
-                    self.retreat(rig, state, &parks)?;
-                    state.parked = parks;
-                } else {
-                    self.start_next_episode(rig, start, state)?;
-                    n_in_episode = 0;
+            }
+            if is_blocked || state.parked.contains(&true) {
+                let objects = rig.observe_objects()?;
+                match self.next_turn(&objects, start, state, is_blocked) {
+                    Turn::Same => {}
+                    Turn::Parks(parks) => {
+                        self.retreat(rig, state, &parks)?;
+                        state.parked = parks;
+                        n_in_episode = 0;
+                    }
+                    Turn::NextEpisode => {
+                        self.start_next_episode(rig, start, state)?;
+                        n_in_episode = 0;
+                    }
                 }
             }
+        }
+    }
+
+    /// Decides which arms make way: those whose objects lie at their goals on the table. If there are none and the arms
+    /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
+    /// the other one. Its turn comes when the object of the other one lies at its goal.
+    fn next_turn(
+        &self,
+        objects: &[ObjectPose],
+        start: &TrialStart,
+        state: &mut LoopState,
+        is_blocked: bool,
+    ) -> Turn {
+        let misplaced: Vec<bool> = self.misplaced(objects, start).collect();
+        let is_waiting =
+            misplaced.iter().zip(&state.parked).any(|(misplaced, parked)| *misplaced && *parked);
+        let parks = self.parking(objects, &misplaced, state);
+        if (is_blocked || is_waiting) && parks.contains(&true) {
+            return Turn::Parks(parks);
+        }
+        if !is_blocked {
+            return Turn::Same;
+        }
+        match self.goal_distances_m(objects, start)[..] {
+            [one_m, other_m] if !state.parked.contains(&true) => {
+                let waiting = (usize::from(other_m > one_m) + state.n_waits) % 2;
+                state.n_waits += 1;
+                Turn::Parks(vec![waiting == 0, waiting == 1])
+            }
+            _ => Turn::NextEpisode,
         }
     }
 
@@ -120,22 +171,15 @@ impl TrialRunner {
         Ok(())
     }
 
-    /// Returns the arms that are not parked and whose objects lie at their goals on the table.
-    fn parking(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &LoopState,
-    ) -> Result<Vec<bool>, FailureCause> {
-        let objects = rig.observe_objects()?;
+    /// Returns the arms that are not parked and whose objects are not `misplaced` and lie on the table.
+    fn parking(&self, objects: &[ObjectPose], misplaced: &[bool], state: &LoopState) -> Vec<bool> {
         let lies = |(arm, object): (usize, &ObjectPose)| {
             let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
             height_m - self.config.trained_half_m < LYING_M
         };
-        let lying: Vec<bool> = objects.iter().enumerate().map(lies).collect();
-        let placed = self.misplaced(&objects, start).map(|misplaced| !misplaced);
-        let parks = placed.zip(lying).zip(&state.parked);
-        Ok(parks.map(|((placed, lies), parked)| placed && lies && !parked).collect())
+        let lying = objects.iter().enumerate().map(lies);
+        let parks = misplaced.iter().zip(lying).zip(&state.parked);
+        parks.map(|((misplaced, lies), parked)| !misplaced && lies && !parked).collect()
     }
 
     /// Opens the grippers of the `retreating` arms, raises their hands and withdraws them toward their bases, as far as
@@ -179,9 +223,17 @@ impl TrialRunner {
     /// Returns for each arm whether its object is away from its goal.
     fn misplaced(&self, objects: &[ObjectPose], start: &TrialStart) -> impl Iterator<Item = bool> {
         let near_m = DONE_SHARE * self.tolerance_m();
-        objects.iter().zip(&start.goals).enumerate().map(move |(arm, (object, goal))| {
-            self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal) > near_m
-        })
+        self.goal_distances_m(objects, start).into_iter().map(move |distance_m| distance_m > near_m)
+    }
+
+    /// Returns for each arm the distance from its object to its goal, metres.
+    fn goal_distances_m(&self, objects: &[ObjectPose], start: &TrialStart) -> Vec<f64> {
+        let goals = objects.iter().zip(&start.goals).enumerate();
+        goals
+            .map(|(arm, (object, goal))| {
+                self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal)
+            })
+            .collect()
     }
 }
 
@@ -196,6 +248,7 @@ impl LoopState {
 
 #[cfg(test)]
 mod tests {
+    use glam::DQuat;
     use tandem_core::Task;
 
     use super::*;
@@ -216,5 +269,45 @@ mod tests {
         runner.keep_parked(&mut state, &mut wanted);
         assert_eq!(wanted.hands, [moved[0], hands[1]]);
         assert_eq!(wanted.openings_m, [0.01, start.opening_m]);
+    }
+
+    #[test]
+    fn arms_that_block_each_other_take_turns() {
+        let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
+        let mut runner = TrialRunner::new(config).unwrap();
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        let objects = |distances_m: [f64; 2]| {
+            let pose = |(arm, distance_m): (usize, f64)| {
+                let own = start.goals[arm] + DVec3::X * distance_m;
+                let at_m = runner.mapping.object_in_world(ArmIndex(arm), own);
+                ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+            };
+            distances_m.into_iter().enumerate().map(pose).collect::<Vec<_>>()
+        };
+        let neither = objects([0.1, 0.2]);
+        let mut turn = |objects: &[ObjectPose], parked: [bool; 2], is_blocked| {
+            state.parked = parked.to_vec();
+            runner.next_turn(objects, &start, &mut state, is_blocked)
+        };
+        let parks = |arms: [bool; 2]| Turn::Parks(arms.to_vec());
+        assert_eq!(turn(&neither, [false; 2], false), Turn::Same);
+        assert_eq!(turn(&neither, [false; 2], true), parks([false, true]), "the farther one waits");
+        assert_eq!(turn(&neither, [false, true], false), Turn::Same);
+        let first = objects([0.0, 0.2]);
+        assert_eq!(
+            turn(&first, [false, true], false),
+            parks([true, false]),
+            "the other one's turn"
+        );
+        assert_eq!(turn(&first, [true, false], false), Turn::Same, "nothing waits");
+        assert_eq!(
+            turn(&neither, [false, true], true),
+            Turn::NextEpisode,
+            "blocked although one waits"
+        );
+        assert_eq!(turn(&neither, [false; 2], true), parks([true, false]), "roles alternate");
+        assert_eq!(turn(&first, [false; 2], true), parks([true, false]), "placed ones make way");
     }
 }
