@@ -8,8 +8,9 @@ pub mod safetensors_file;
 pub mod sample;
 
 use std::alloc::System;
+use std::panic;
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
+use std::sync::{Once, OnceLock};
 
 use cap::Cap;
 use tempfile::TempDir;
@@ -26,11 +27,22 @@ pub type Mutate = fn(data: &mut [u8], size: usize, max_size: usize) -> usize;
 
 /// Runs `decode`, which aborts the process when it takes more than 64 MiB.
 pub fn with_bounded_memory<T>(decode: impl FnOnce() -> T) -> T {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(lift_limit_on_panic);
     let limit = ALLOCATOR.allocated() + MAX_BYTES;
     ALLOCATOR.set_limit(limit).expect("the limit exceeds the allocated memory");
     let decoded = decode();
     ALLOCATOR.set_limit(usize::MAX).expect("no limit is too low");
     decoded
+}
+
+/// Lets a panic take the memory that its backtrace needs.
+fn lift_limit_on_panic() {
+    let hook = panic::take_hook();
+    panic::set_hook(Box::new(move |info| {
+        ALLOCATOR.set_limit(usize::MAX).expect("no limit is too low");
+        hook(info);
+    }));
 }
 
 /// Returns the path of this process's scratch file `name`.

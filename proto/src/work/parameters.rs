@@ -90,7 +90,7 @@ fn decode_gate(
     layout: &TaskSpec,
 ) -> Result<Option<PublishedGate>, DecodeError> {
     if parameters.n_critics == 0 {
-        return Ok(None);
+        return without_gate(parameters).map(|()| None);
     }
     let count = |field, count, most| count_within(field, count, &(1..=most)).map(to_usize);
     let n_critics = count("n_critics", parameters.n_critics, MAX_CRITICS)?;
@@ -108,6 +108,21 @@ fn decode_gate(
         critics: finite_from_bytes("critics", &parameters.critics, n_parameters)?,
         threshold: one_within("ask_above", parameters.ask_above, &(0.0..=f32::MAX))?,
     }))
+}
+
+/// Refuses fields of a gate in a message without critics.
+fn without_gate(parameters: &pb::Parameters) -> Result<(), DecodeError> {
+    let fields = [
+        ("n_critic_hidden", parameters.n_critic_hidden != 0),
+        ("n_critic_layers", parameters.n_critic_layers != 0),
+        ("n_critic_heads", parameters.n_critic_heads != 0),
+        ("critics", !parameters.critics.is_empty()),
+        ("ask_above", parameters.ask_above.to_bits() != 0),
+    ];
+    match fields.iter().find(|(_, is_set)| *is_set) {
+        Some((field, _)) => Err(DecodeError::new(*field, "no value without critics", "one")),
+        None => Ok(()),
+    }
 }
 
 /// Returns the number of parameters of an actor for `layout` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
@@ -178,6 +193,11 @@ mod tests {
         };
         check(|m| m.n_critics = 65, "n_critics: expected 1 to 64, got 65");
         check(|m| m.n_critic_heads = 3, "n_critic_heads: expected 1 to 2, got 3");
+        check(|m| m.n_critics = 0, "n_critic_hidden: expected no value without critics, got one");
+        let rest = |m: &mut pb::Parameters| {
+            *m = pb::Parameters { ask_above: 0.5, ..encode_actor(&actor()) }
+        };
+        check(rest, "ask_above: expected no value without critics, got one");
         check(|m| m.n_critics = 2, "critics: expected 612 numbers, got 918 numbers");
         check(|m| m.critics[..4].fill(0xff), "critics[0]: expected a finite number, got NaN");
     }
