@@ -51,8 +51,8 @@ fn encode_gate(gate: &PublishedGate) -> pb::Parameters {
 /// Decodes the parameters of an actor for `layout`.
 ///
 /// # Errors
-/// Returns an error if a length does not match the layout and the network's size, a number is not finite or a standard
-/// deviation is not positive.
+/// Returns an error if a length does not match the layout and the network's size, a number is not finite, a standard
+/// deviation is not positive or a message without critics has other fields of a gate.
 pub fn decode_actor(
     parameters: &pb::Parameters,
     layout: impl Into<TaskSpec>,

@@ -167,7 +167,8 @@ impl Rectangle {
     }
 }
 
-fn direction(angle_rad: f64) -> DVec2 {
+/// Returns the unit vector at an angle from x.
+pub(crate) fn direction(angle_rad: f64) -> DVec2 {
     let (sin, cos) = libm::sincos(angle_rad);
     DVec2::new(cos, sin)
 }

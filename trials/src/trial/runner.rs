@@ -184,6 +184,14 @@ impl TrialRunner {
         self.task.tolerance().into()
     }
 
+    /// Returns for each arm the distance from its object to its goal, metres.
+    pub(super) fn goal_distances_m(&self, objects: &[ObjectPose], start: &TrialStart) -> Vec<f64> {
+        let distance_m = |(arm, (object, goal)): (usize, (&ObjectPose, &DVec3))| {
+            self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal)
+        };
+        objects.iter().zip(&start.goals).enumerate().map(distance_m).collect()
+    }
+
     /// Returns whether every object is at its goal, and every arm meets the task's other conditions, in truth.
     pub(super) fn is_success(&self, rig: &TrialRig<'_>, start: &TrialStart) -> bool {
         let objects = rig.pair().objects();
@@ -212,9 +220,6 @@ impl TrialRunner {
             TrialRig::new(self.mapping.cell().clone(), pair, Goals::default(), &mut observer)?;
         let execution = self.closed_loop(&mut rig, start, at, policy);
         let ends = rig.pair().objects();
-        let distance = |(arm, goal): (usize, &DVec3)| {
-            (self.mapping.object_in_own(ArmIndex(arm), ends[arm].at_m) - *goal).length()
-        };
         let (waypoints, motion) = match execution.ended {
             Ok(()) => self.blind_motion(execution.waypoints, at),
             Err(cause) => (Vec::new(), Err(cause)),
@@ -222,7 +227,7 @@ impl TrialRunner {
         Ok(PlannedMotion {
             waypoints,
             motion,
-            rehearsed_m: start.goals.iter().enumerate().map(distance).collect(),
+            rehearsed_m: self.goal_distances_m(&ends, start),
             n_steps: execution.n_steps,
         })
     }

@@ -19,7 +19,7 @@ use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
 /// A policy is done after this many consecutive observations of placed objects that stay there.
 const DONE_OBSERVATIONS: usize = 5;
-/// By this many the steps that the arms do not carry out in full exceed the others when an arm makes way.
+/// An arm makes way when the steps that the arms did not carry out in full outnumber the others by this many.
 const MAX_BLOCKED: usize = 10;
 /// Height above the table, metres, below which an object lies on it.
 const LYING_M: f64 = 0.01;
@@ -29,9 +29,11 @@ const RISE_M: f64 = 0.06;
 /// What follows a step when arms block each other or an arm waits.
 #[derive(Debug, PartialEq)]
 enum Turn {
+    /// All arms continue as before.
     Same,
-    /// These arms retreat and stay out of the way, and the others go on.
+    /// These arms retreat and keep out of the way; the others continue.
     Parks(Vec<bool>),
+    /// All arms begin another episode.
     NextEpisode,
 }
 
@@ -224,16 +226,6 @@ impl TrialRunner {
     fn misplaced(&self, objects: &[ObjectPose], start: &TrialStart) -> impl Iterator<Item = bool> {
         let near_m = DONE_SHARE * self.tolerance_m();
         self.goal_distances_m(objects, start).into_iter().map(move |distance_m| distance_m > near_m)
-    }
-
-    /// Returns for each arm the distance from its object to its goal, metres.
-    fn goal_distances_m(&self, objects: &[ObjectPose], start: &TrialStart) -> Vec<f64> {
-        let goals = objects.iter().zip(&start.goals).enumerate();
-        goals
-            .map(|(arm, (object, goal))| {
-                self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal)
-            })
-            .collect()
     }
 }
 

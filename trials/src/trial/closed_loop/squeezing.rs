@@ -3,10 +3,10 @@
 //! In the training world the servos of both hands have a limited force, so the hands and the blocks stand still. Arms
 //! would squeeze the blocks within a few hundredths of a second, too fast to yield. Such steps are therefore slow.
 
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use super::{LoopState, WantedStep};
-use crate::trial::block_avoidance::ObservedBlock;
+use crate::trial::block_avoidance::{ObservedBlock, direction};
 use crate::trial::runner::TrialRunner;
 
 /// The length of the line from hand to hand outside the blocks below which a step is slow, metres. The pads take 1 to
@@ -44,21 +44,15 @@ fn room_m(one: DVec3, other: DVec3, blocks: &[ObservedBlock]) -> Option<f64> {
 
 /// Returns the share of the line between two points that is within `block`.
 fn share_within(one: DVec3, other: DVec3, block: &ObservedBlock) -> f64 {
-    let (sin, cos) = libm::sincos(-block.yaw_rad);
     let local = |point: DVec3| {
         let offset = point - block.at;
-        DVec2::new(cos, sin).rotate(offset.truncate()).extend(offset.z).to_array()
+        direction(-block.yaw_rad).rotate(offset.truncate()).extend(offset.z).to_array()
     };
     let (from, to, half) = (local(one), local(other), block.half_m.to_array());
     let (mut enters, mut leaves) = (0.0_f64, 1.0_f64);
     for axis in 0..3 {
+        // A line along a side crosses it at infinity, which leaves the whole line or nothing.
         let way = to[axis] - from[axis];
-        if way == 0.0 {
-            if from[axis].abs() >= half[axis] {
-                return 0.0;
-            }
-            continue;
-        }
         let crossing = [-half[axis], half[axis]].map(|side| (side - from[axis]) / way);
         enters = enters.max(crossing[0].min(crossing[1]));
         leaves = leaves.min(crossing[0].max(crossing[1]));
