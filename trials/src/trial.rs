@@ -34,6 +34,7 @@ pub mod rehearsal;
 mod block_avoidance;
 mod closed_loop;
 mod coordination;
+mod copies;
 mod noise;
 mod open_loop;
 mod rig;

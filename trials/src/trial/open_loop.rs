@@ -9,16 +9,22 @@ use crate::trial::noise::add_noise;
 use crate::trial::outcome::{FailureCause, MotionRefusal};
 use crate::trial::rehearsal::{Rollout, TrialStart};
 use crate::trial::rig::TrialRig;
-use crate::trial::robustness::Robustness;
 use crate::trial::runner::{REST_S, STEP_GAP_M, TrialExecution, TrialRunner};
 use crate::trial::{ActionSource, TrialError};
 
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
+/// A rehearsal that fails in this many more variants of the training world than the best one is not tried on the copies of
+/// the pair.
+const VARIANTS_MARGIN: usize = 2;
+/// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of the
+/// training world.
+const ENOUGH_VARIANTS: usize = 1;
 /// Height by which a hand that withdraws first rises, metres.
 const LIFT_M: f64 = 0.06;
 
 /// A motion that was planned before its execution.
+#[derive(Clone)]
 pub(super) struct PlannedMotion {
     /// The waypoints of the tools; empty if an arm cannot reach them.
     pub(super) waypoints: Vec<Waypoint>,
@@ -29,16 +35,26 @@ pub(super) struct PlannedMotion {
     pub(super) n_steps: usize,
 }
 
+/// A motion that may be executed.
+struct Candidate {
+    /// The number of copies of the pair on which it fails.
+    n_failed_copies: usize,
+    /// The number of variants of the training world in which the actions of its rehearsal fail.
+    n_failed_variants: usize,
+    planned: PlannedMotion,
+}
+
 impl TrialRunner {
-    /// Plans the most robust of the configured number of episodes in the training world. The actions of all but the first
-    /// one have noise.
+    /// Plans the most robust of the configured number of episodes in the training world: the one that fails on the fewest
+    /// copies of the pair and, of those, in the fewest variants of the training world. The actions of all but the first
+    /// episode have noise.
     pub(super) fn rehearse(
         &self,
         start: &TrialStart,
         at: &[Joints],
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let rollout = self.rehearsal.play(policy)?;
+        let mut rollout = self.rehearsal.play(policy)?;
         let first = self.planned(&rollout, start, at);
         let Some(variants) = self.rehearsal.variants() else { return Ok(first) };
         let mut noise = episode_rng(self.config.seed, start.number, Stream::Exploration);
@@ -46,29 +62,32 @@ impl TrialRunner {
             policy.act(observation, goal, action);
             add_noise(&mut noise, action);
         };
-        let mut best: Option<(Robustness, PlannedMotion)> = None;
-        if first.motion.is_ok() {
-            let robustness = variants.robustness(&rollout, usize::MAX)?;
-            best = robustness.map(|robustness| (robustness, first));
-        }
-        for _ in 1..self.config.n_rehearsals {
-            let max_failed = best.as_ref().map_or(usize::MAX, |(most, _)| most.n_failed);
-            if max_failed == 0 {
-                break;
+        let mut fewest_variants = usize::MAX;
+        let mut best: Option<Candidate> = None;
+        for idx in 0..self.config.n_rehearsals {
+            if idx > 0 {
+                rollout = self.rehearsal.play(&mut noisy)?;
             }
-            let rollout = self.rehearsal.play(&mut noisy)?;
-            let Some(robustness) = variants.robustness(&rollout, max_failed)? else {
+            let max_failed = fewest_variants.saturating_add(VARIANTS_MARGIN);
+            let Some(n_failed_variants) = variants.n_failed(&rollout, max_failed)? else {
                 continue;
             };
-            if best.as_ref().is_some_and(|(most, _)| robustness <= *most) {
+            fewest_variants = fewest_variants.min(n_failed_variants);
+            let Some(max_failed) = max_failed_copies(best.as_ref(), n_failed_variants) else {
+                continue;
+            };
+            let planned = self.planned(&rollout, start, at);
+            if planned.motion.is_err() {
                 continue;
             }
-            let planned = self.planned(&rollout, start, at);
-            if planned.motion.is_ok() {
-                best = Some((robustness, planned));
+            let n_failed_copies = self.n_failed_copies(start, at, &planned, max_failed)?;
+            let Some(n_failed_copies) = n_failed_copies else { continue };
+            best = Some(Candidate { n_failed_copies, n_failed_variants, planned });
+            if n_failed_copies == 0 && n_failed_variants <= ENOUGH_VARIANTS {
+                break;
             }
         }
-        Ok(best.map_or_else(|| self.planned(&rollout, start, at), |(_, planned)| planned))
+        Ok(best.map_or(first, |best| best.planned))
     }
 
     /// Converts an episode in the training world to a motion.
@@ -205,6 +224,16 @@ impl TrialRunner {
     }
 }
 
+/// Returns the largest number of copies on which a motion may fail that is to be preferred to `best`, or `None` if there
+/// is no such number.
+fn max_failed_copies(best: Option<&Candidate>, n_failed_variants: usize) -> Option<usize> {
+    match best {
+        None => Some(usize::MAX),
+        Some(best) if n_failed_variants < best.n_failed_variants => Some(best.n_failed_copies),
+        Some(best) => best.n_failed_copies.checked_sub(1),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use tandem_core::Task;
@@ -214,6 +243,26 @@ mod tests {
 
     fn runner(task: Task) -> TrialRunner {
         TrialRunner::new(test_config(task, TrialMode::OpenLoop, 1)).unwrap()
+    }
+
+    #[test]
+    fn a_motion_is_preferred_if_it_fails_on_fewer_copies_or_on_as_many_and_in_fewer_variants() {
+        let planned = PlannedMotion {
+            waypoints: Vec::new(),
+            motion: Err(FailureCause::TimedOut),
+            rehearsed_m: Vec::new(),
+            n_steps: 0,
+        };
+        let best = |n_failed_copies, n_failed_variants| Candidate {
+            n_failed_copies,
+            n_failed_variants,
+            planned: planned.clone(),
+        };
+        assert_eq!(max_failed_copies(None, 9), Some(usize::MAX));
+        assert_eq!(max_failed_copies(Some(&best(2, 3)), 2), Some(2));
+        assert_eq!(max_failed_copies(Some(&best(2, 3)), 3), Some(1));
+        assert_eq!(max_failed_copies(Some(&best(0, 3)), 2), Some(0));
+        assert_eq!(max_failed_copies(Some(&best(0, 3)), 3), None);
     }
 
     #[test]

@@ -2,10 +2,7 @@
 //!
 //! A blind motion cannot react to the differences between the world of its rehearsal and the one of its execution. Each
 //! variant of the training world differs in friction and mass, and its hands are displaced by a few millimetres. In more
-//! than half of them the pads that grasp are of rubber. Of several rehearsals, the one is executed whose actions reach the
-//! goals in the most variants.
-
-use std::cmp::Ordering;
+//! than half of them the pads that grasp are of rubber.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Contacts, Layout, TaskSpec, WorldSettings};
@@ -28,7 +25,7 @@ const DIFFERENCES: [Difference; 9] = [
     Difference { friction: 1.0, pads: RUBBER, mass: 0.8, offset_m: [0.004, -0.004] },
 ];
 /// Share of the tolerance within which a robust motion brings the objects to their goals.
-const USED_TOLERANCE: f64 = 0.8;
+pub(super) const USED_TOLERANCE: f64 = 0.8;
 
 /// The difference between a variant and the training world.
 struct Difference {
@@ -55,15 +52,6 @@ pub(super) struct Variants {
     worlds: Vec<Variant>,
 }
 
-/// The success of a rollout's actions in the variants. A greater one is better.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Robustness {
-    /// The number of variants in which the actions fail or lead to contacts.
-    pub(super) n_failed: usize,
-    /// The mean over the variants of the largest final distance of an object from its goal, metres.
-    mean_distance_m: f64,
-}
-
 impl Variants {
     /// Creates the variants of the world of `layout` with `config` and actions that move a hand by `action_m` metres.
     pub(super) fn new(
@@ -86,36 +74,33 @@ impl Variants {
         }
     }
 
-    /// Executes the actions of `rollout` in all variants. Returns `None` if they fail in more than `max_failed` variants.
-    pub(super) fn robustness(
+    /// Executes the actions of `rollout` in the variants. Returns the number of those in which they fail or lead to
+    /// contacts, or `None` if they are more than `max_failed`.
+    pub(super) fn n_failed(
         &self,
         rollout: &Rollout,
         max_failed: usize,
-    ) -> Result<Option<Robustness>, SimError> {
+    ) -> Result<Option<usize>, SimError> {
         let mut n_failed = 0;
-        let mut sum_m = 0.0;
         for variant in &self.worlds {
-            let (succeeds, distance_m) = self.play(variant, rollout)?;
-            n_failed += usize::from(!succeeds);
-            sum_m += distance_m;
+            n_failed += usize::from(!self.succeeds(variant, rollout)?);
             if n_failed > max_failed {
                 return Ok(None);
             }
         }
-        Ok(Some(Robustness { n_failed, mean_distance_m: sum_m / self.worlds.len() as f64 }))
+        Ok(Some(n_failed))
     }
 
-    /// Returns whether the actions succeed without contacts, and the largest final distance of an object, metres.
-    fn play(&self, variant: &Variant, rollout: &Rollout) -> Result<(bool, f64), SimError> {
+    /// Returns whether the actions succeed without contacts.
+    fn succeeds(&self, variant: &Variant, rollout: &Rollout) -> Result<bool, SimError> {
         let (env, contacts) = self.executed(variant, rollout)?;
         let mut observation = vec![0.0; self.layout.n_observation()];
         env.observe(&mut observation);
         let distance_m = goal_distances_m(&env, &observation).into_iter().fold(0.0, f64::max);
         let task = TaskSpec::from(self.layout);
-        let succeeds = task.is_success(&observation, env.goal())
+        Ok(task.is_success(&observation, env.goal())
             && distance_m <= USED_TOLERANCE * f64::from(task.tolerance())
-            && contacts == Contacts::NONE;
-        Ok((succeeds, distance_m))
+            && contacts == Contacts::NONE)
     }
 
     /// Executes the actions with displaced hands.
@@ -135,13 +120,6 @@ impl Variants {
             contacts = contacts | env.step(&action)?;
         }
         Ok((env, contacts))
-    }
-}
-
-impl PartialOrd for Robustness {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        let fewer = other.n_failed.cmp(&self.n_failed);
-        Some(fewer.then(other.mean_distance_m.total_cmp(&self.mean_distance_m)))
     }
 }
 
@@ -223,11 +201,8 @@ mod tests {
                 }
             }
         }
-        let robustness = variants.robustness(&rollout, usize::MAX).unwrap().unwrap();
-        assert_eq!(robustness.n_failed, DIFFERENCES.len());
-        assert_eq!(variants.robustness(&rollout, 3).unwrap(), None);
-        let better = Robustness { n_failed: 1, mean_distance_m: 0.2 };
-        assert!(better > robustness && better < Robustness { mean_distance_m: 0.1, ..better });
+        assert_eq!(variants.n_failed(&rollout, usize::MAX).unwrap(), Some(DIFFERENCES.len()));
+        assert_eq!(variants.n_failed(&rollout, 3).unwrap(), None);
     }
 
     #[test]

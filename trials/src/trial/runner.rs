@@ -8,9 +8,8 @@ use tandem_kinematics::{
 };
 use tandem_sim::SimError;
 
-use crate::simulated::{
-    Block, CameraConfig, GripperConfig, ObjectPose, SimulatedConfig, SimulatedPair, single,
-};
+use crate::simulated::{Block, ObjectPose, SimulatedConfig, SimulatedPair, single};
+use crate::trial::copies::copy_of;
 use crate::trial::mapping::Mapping;
 use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{
@@ -124,7 +123,7 @@ impl TrialRunner {
         Ok(self.report(number, &start, &initial, &rig, execution))
     }
 
-    fn report(
+    pub(super) fn report(
         &self,
         number: u64,
         start: &TrialStart,
@@ -214,7 +213,7 @@ impl TrialRunner {
         number: u64,
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let pair = self.pair(start, at, number, &twin_of(&self.config.simulated));
+        let pair = self.pair(start, at, number, &copy_of(&self.config.simulated, TWIN_FRICTION));
         let mut observer = NoObserver;
         let mut rig =
             TrialRig::new(self.mapping.cell().clone(), pair, Goals::default(), &mut observer)?;
@@ -286,7 +285,7 @@ impl TrialRunner {
         own.iter().enumerate().map(point).collect()
     }
 
-    fn pair(
+    pub(super) fn pair(
         &self,
         start: &TrialStart,
         at: &[Joints],
@@ -323,7 +322,10 @@ fn has_range(placed: &PlacedArm, at: &Joints) -> bool {
 }
 
 /// Returns the joint angles of the arms at `start`, radians.
-fn start_angles(mapping: &Mapping, start: &TrialStart) -> Result<Vec<Joints>, TrialError> {
+pub(super) fn start_angles(
+    mapping: &Mapping,
+    start: &TrialStart,
+) -> Result<Vec<Joints>, TrialError> {
     let angles = |(arm, hand): (usize, &DVec3)| {
         let near = Joints::new(mapping.cell().arms[arm].model.elbow_up_rad);
         let found = mapping.tool_in_world(ArmIndex(arm), *hand, &near);
@@ -336,23 +338,6 @@ fn start_angles(mapping: &Mapping, start: &TrialStart) -> Result<Vec<Joints>, Tr
 pub(super) fn unreachable(arm: ArmIndex, source: ReachError) -> FailureCause {
     let error = PlanError::Unreachable { waypoint: 0, arm, source };
     FailureCause::Refused(MotionRefusal::Plan(error))
-}
-
-/// Returns the configuration of the twin: the pair without noise and latency and with other friction.
-fn twin_of(simulated: &SimulatedConfig) -> SimulatedConfig {
-    SimulatedConfig {
-        latency_periods: [1, 1],
-        angle_noise_rad: 0.0,
-        rate_noise_radps: 0.0,
-        torque_noise_nm: 0.0,
-        camera: CameraConfig { place_noise_m: 0.0, turn_noise_rad: 0.0, ..simulated.camera },
-        gripper: GripperConfig {
-            pad_friction: TWIN_FRICTION * simulated.gripper.pad_friction,
-            ..simulated.gripper
-        },
-        table_friction: TWIN_FRICTION * simulated.table_friction,
-        ..simulated.clone()
-    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,106 @@
+//! Motions that also succeed on copies of the pair.
+//!
+//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. A blind
+//! motion is therefore executed on copies of the pair before one is chosen. The copies have no noise, and none of them has
+//! the friction of the pair.
+
+use tandem_kinematics::Joints;
+
+use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig};
+use crate::trial::open_loop::PlannedMotion;
+use crate::trial::outcome::ObjectResult;
+use crate::trial::rehearsal::TrialStart;
+use crate::trial::rig::{Goals, TrialRig};
+use crate::trial::robustness::USED_TOLERANCE;
+use crate::trial::runner::TrialRunner;
+use crate::trial::{NoObserver, TrialError};
+
+/// The friction of each copy, as a share of the pair's.
+const FRICTIONS: [f32; 4] = [0.8, 1.2, 0.9, 1.1];
+
+impl TrialRunner {
+    /// Executes a planned motion blindly on the copies of the pair. Returns the number of those on which it fails, or
+    /// `None` if they are more than `max_failed`.
+    pub(super) fn n_failed_copies(
+        &self,
+        start: &TrialStart,
+        at: &[Joints],
+        planned: &PlannedMotion,
+        max_failed: usize,
+    ) -> Result<Option<usize>, TrialError> {
+        let mut n_failed = 0;
+        for friction in FRICTIONS {
+            n_failed += usize::from(!self.succeeds_on_copy(start, at, planned, friction)?);
+            if n_failed > max_failed {
+                return Ok(None);
+            }
+        }
+        Ok(Some(n_failed))
+    }
+
+    fn succeeds_on_copy(
+        &self,
+        start: &TrialStart,
+        at: &[Joints],
+        planned: &PlannedMotion,
+        friction: f32,
+    ) -> Result<bool, TrialError> {
+        let simulated = copy_of(&self.config.simulated, friction);
+        let pair = self.pair(start, at, start.number, &simulated);
+        let initial = pair.objects();
+        let (cell, mut observer) = (self.mapping.cell().clone(), NoObserver);
+        let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer)?;
+        let execution = self.open_loop(&mut rig, start, planned.clone());
+        let report = self.report(start.number, start, &initial, &rig, execution);
+        let near_m = USED_TOLERANCE * self.tolerance_m();
+        let is_near = |object: &ObjectResult| object.end.distance(object.goal) <= near_m;
+        Ok(report.cause.is_none() && report.objects.iter().all(is_near))
+    }
+}
+
+/// Returns the configuration of a copy: the pair without noise and latency, and with `friction` times its friction.
+pub(super) fn copy_of(simulated: &SimulatedConfig, friction: f32) -> SimulatedConfig {
+    SimulatedConfig {
+        latency_periods: [1, 1],
+        angle_noise_rad: 0.0,
+        rate_noise_radps: 0.0,
+        torque_noise_nm: 0.0,
+        camera: CameraConfig { place_noise_m: 0.0, turn_noise_rad: 0.0, ..simulated.camera },
+        gripper: GripperConfig {
+            pad_friction: friction * simulated.gripper.pad_friction,
+            ..simulated.gripper
+        },
+        table_friction: friction * simulated.table_friction,
+        ..simulated.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use tandem_core::Task;
+
+    use super::*;
+    use crate::trial::runner::start_angles;
+    use crate::trial::{TrialMode, test_config};
+
+    #[test]
+    fn a_motion_succeeds_on_the_copies_only_if_it_brings_the_objects_to_their_goals() {
+        let config = test_config(Task::SharedPush, TrialMode::OpenLoop, 1);
+        let mut runner = TrialRunner::new(config).unwrap();
+        let start = runner.start(0).unwrap();
+        let near = runner.mapping.cell().ready(0.2).unwrap();
+        let tools = |hands: &[DVec3]| runner.waypoint(hands, &[0.0; 2], &near).unwrap();
+        let raised: Vec<DVec3> = start.hands.iter().map(|hand| *hand + DVec3::Z * 0.02).collect();
+        let waypoints = vec![tools(&start.hands), tools(&raised)];
+        let at = start_angles(&runner.mapping, &start).unwrap();
+        let (waypoints, motion) = runner.blind_motion(waypoints, &at);
+        let idle = PlannedMotion { waypoints, motion, rehearsed_m: vec![0.0; 2], n_steps: 1 };
+        let n_failed =
+            |start, max_failed| runner.n_failed_copies(start, &at, &idle, max_failed).unwrap();
+        assert_eq!(n_failed(&start, usize::MAX), Some(FRICTIONS.len()));
+        assert_eq!(n_failed(&start, 1), None);
+        let solved = TrialStart { goals: start.objects.clone(), ..start.clone() };
+        assert_eq!(n_failed(&solved, 0), Some(0));
+    }
+}
