@@ -43,9 +43,10 @@ pub(crate) struct TrialArgs {
     /// Seed of starts, goals and the arms' noise, the same for all policies and modes.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
-    /// Largest number of rehearsals in open loop, of which the most robust one is executed; 1 is the paper's method. An
-    /// object that both arms share is rehearsed once.
-    #[arg(long, value_name = "N", default_value_t = 32,
+    /// Largest number of rehearsals of an open loop in the training world and, if none is robust, in the closed loop on
+    /// copies of the pair. The most robust one is executed. 1 is the paper's method: a single one, in the training world.
+    /// An object that both arms share is rehearsed once.
+    #[arg(long, value_name = "N", default_value_t = 16,
         value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) rehearsals: u32,
     /// Fraction of the highest speed, above 0 and at most 1.

@@ -92,8 +92,9 @@ pub struct TrialConfig {
     /// Half the edge of the blocks that the policy was trained with, metres: [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M),
     /// or that of `block` if their sizes varied. The policy perceives blocks and openings as those of such a block.
     pub trained_half_m: f64,
-    /// The largest number of rehearsals in the training world, at least 1, of which an open loop executes the most robust
-    /// one. Arms that share an object rehearse once.
+    /// The largest number of rehearsals of an open loop in the training world, at least 1. If it is greater than 1 and none
+    /// is robust, as many may follow in the closed loop on copies of the pair. The most robust one is executed. Arms that
+    /// share an object rehearse once.
     pub n_rehearsals: u32,
     /// The seed of starts, goals, latencies and noise.
     pub seed: u64,

@@ -70,13 +70,13 @@ fn a_hand_that_would_press_on_its_block_continues() {
     );
 }
 
-/// Returns the shipped student of push, which does nothing in its first episode.
-fn idle_at_first() -> impl FnMut(&[f32], &[f32], &mut [f32]) {
+/// Returns the shipped student of push, which does nothing in its first `n_episodes` episodes.
+fn idle_at_first(n_episodes: usize) -> impl FnMut(&[f32], &[f32], &mut [f32]) {
     let mut actor = shipped("student-push-classic.safetensors");
     let mut n_actions = 0;
     move |observation: &[f32], goal: &[f32], action: &mut [f32]| {
         n_actions += 1;
-        if n_actions <= EPISODE_STEPS {
+        if n_actions <= n_episodes * EPISODE_STEPS {
             action.fill(0.0);
         } else {
             actor.act(observation, goal, action);
@@ -87,7 +87,7 @@ fn idle_at_first() -> impl FnMut(&[f32], &[f32], &mut [f32]) {
 #[test]
 fn a_policy_that_fails_plays_another_episode() {
     let mut trials = trials(Task::Push, TrialMode::ClosedLoop, 2);
-    let report = trials.run(0, &mut idle_at_first(), &mut NoObserver).unwrap();
+    let report = trials.run(0, &mut idle_at_first(1), &mut NoObserver).unwrap();
     assert_eq!(report.cause, None);
     assert!(report.n_steps > EPISODE_STEPS, "{}", report.n_steps);
 }
@@ -188,9 +188,19 @@ fn an_idle_policy_does_not_reach_its_goals_and_is_observed() {
 #[test]
 fn a_blind_motion_is_the_best_of_several_rehearsals() {
     let mut trials = trials(Task::Push, TrialMode::OpenLoop, 1);
-    let report = trials.run(0, &mut idle_at_first(), &mut NoObserver).unwrap();
+    let report = trials.run(0, &mut idle_at_first(1), &mut NoObserver).unwrap();
     let rehearsed_m = report.rehearsed_m.unwrap();
     assert!(rehearsed_m.iter().all(|distance_m| *distance_m < 0.04), "{rehearsed_m:?}");
+}
+
+#[test]
+fn a_blind_motion_is_also_rehearsed_in_the_closed_loop_on_copies_of_the_pair() {
+    let n_rehearsals = 4;
+    let config = TrialConfig { n_rehearsals, ..config(Task::Push, TrialMode::OpenLoop, 1) };
+    let mut trials = TrialRunner::new(config).unwrap();
+    let mut policy = idle_at_first(n_rehearsals as usize);
+    let report = trials.run(0, &mut policy, &mut NoObserver).unwrap();
+    assert_eq!(report.cause, None, "no motion of the training world reaches the goals");
 }
 
 #[test]

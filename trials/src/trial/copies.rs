@@ -16,7 +16,7 @@ use crate::trial::runner::TrialRunner;
 use crate::trial::{NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
-const FRICTIONS: [f32; 4] = [0.8, 1.2, 0.9, 1.1];
+pub(super) const FRICTIONS: [f32; 4] = [0.8, 1.2, 0.9, 1.1];
 
 impl TrialRunner {
     /// Executes a planned motion blindly on the copies of the pair. Returns the number of those on which it fails, or

@@ -5,10 +5,12 @@ use tandem_core::{ArmIndex, Stream, episode_rng};
 use tandem_kinematics::{ArmWaypoint, Joints, Motion, Reason, Refusal, Waypoint};
 
 use crate::trial::coordination::coordinated;
+use crate::trial::copies::FRICTIONS;
 use crate::trial::noise::add_noise;
 use crate::trial::outcome::{FailureCause, MotionRefusal};
 use crate::trial::rehearsal::{Rollout, TrialStart};
 use crate::trial::rig::TrialRig;
+use crate::trial::robustness::Variants;
 use crate::trial::runner::{REST_S, STEP_GAP_M, TrialExecution, TrialRunner};
 use crate::trial::{ActionSource, TrialError};
 
@@ -20,6 +22,8 @@ const VARIANTS_MARGIN: usize = 2;
 /// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of the
 /// training world.
 const ENOUGH_VARIANTS: usize = 1;
+/// The number of failed variants of a rehearsal that was not in the training world.
+const UNTRIED: usize = usize::MAX;
 /// Height by which a hand that withdraws first rises, metres.
 const LIFT_M: f64 = 0.06;
 
@@ -39,35 +43,62 @@ pub(super) struct PlannedMotion {
 struct Candidate {
     /// The number of copies of the pair on which it fails.
     n_failed_copies: usize,
-    /// The number of variants of the training world in which the actions of its rehearsal fail.
+    /// The number of variants of the training world in which the actions of its rehearsal fail, or [`UNTRIED`].
     n_failed_variants: usize,
     planned: PlannedMotion,
 }
 
 impl TrialRunner {
-    /// Plans the most robust of the configured number of episodes in the training world: the one that fails on the fewest
-    /// copies of the pair and, of those, in the fewest variants of the training world. The actions of all but the first
-    /// episode have noise.
+    /// Plans the most robust of several rehearsals: the one that fails on the fewest copies of the pair. If none of those in
+    /// the training world succeeds on all copies, the policy also plays, with noise, in the closed loop on copies.
     pub(super) fn rehearse(
         &self,
         start: &TrialStart,
         at: &[Joints],
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let mut rollout = self.rehearsal.play(policy)?;
-        let first = self.planned(&rollout, start, at);
-        let Some(variants) = self.rehearsal.variants() else { return Ok(first) };
+        let rollout = self.rehearsal.play(policy)?;
+        let Some(variants) = self.rehearsal.variants() else {
+            return Ok(self.planned(&rollout, start, at));
+        };
         let mut noise = episode_rng(self.config.seed, start.number, Stream::Exploration);
         let mut noisy = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
             policy.act(observation, goal, action);
             add_noise(&mut noise, action);
         };
+        let mut best =
+            self.rehearse_in_training_world(start, at, &rollout, variants, &mut noisy)?;
+        for friction in FRICTIONS.into_iter().cycle().take(self.config.n_rehearsals as usize) {
+            let Some(max_failed) = max_failed_copies(best.as_ref(), UNTRIED) else { break };
+            let planned = self.rehearse_on_copy(start, at, friction, &mut noisy)?;
+            if planned.motion.is_err() {
+                continue;
+            }
+            if let Some(n_failed_copies) = self.n_failed_copies(start, at, &planned, max_failed)? {
+                best = Some(Candidate { n_failed_copies, n_failed_variants: UNTRIED, planned });
+            }
+        }
+        Ok(best.map_or_else(|| self.planned(&rollout, start, at), |best| best.planned))
+    }
+
+    /// Returns the most robust of the configured number of episodes in the training world: the one that fails on the fewest
+    /// copies of the pair and, of those, in the fewest variants of the training world. The actions of all but the first
+    /// episode, `first`, have noise. Returns `None` if the check refuses all motions.
+    fn rehearse_in_training_world(
+        &self,
+        start: &TrialStart,
+        at: &[Joints],
+        first: &Rollout,
+        variants: &Variants,
+        noisy: &mut dyn ActionSource,
+    ) -> Result<Option<Candidate>, TrialError> {
         let mut fewest_variants = usize::MAX;
         let mut best: Option<Candidate> = None;
         for idx in 0..self.config.n_rehearsals {
-            if idx > 0 {
-                rollout = self.rehearsal.play(&mut noisy)?;
-            }
+            let rollout = match idx {
+                0 => first.clone(),
+                _ => self.rehearsal.play(noisy)?,
+            };
             let max_failed = fewest_variants.saturating_add(VARIANTS_MARGIN);
             let Some(n_failed_variants) = variants.n_failed(&rollout, max_failed)? else {
                 continue;
@@ -87,7 +118,7 @@ impl TrialRunner {
                 break;
             }
         }
-        Ok(best.map_or(first, |best| best.planned))
+        Ok(best)
     }
 
     /// Converts an episode in the training world to a motion.

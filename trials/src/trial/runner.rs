@@ -108,7 +108,7 @@ impl TrialRunner {
         let at = start_angles(&self.mapping, &start)?;
         let planned = match self.config.mode {
             TrialMode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
-            TrialMode::Twin => Some(self.rehearse_on_twin(&start, &at, number, policy)?),
+            TrialMode::Twin => Some(self.rehearse_on_copy(&start, &at, TWIN_FRICTION, policy)?),
             TrialMode::ClosedLoop => None,
         };
         let pair = self.pair(&start, &at, number, &self.config.simulated);
@@ -205,15 +205,15 @@ impl TrialRunner {
         })
     }
 
-    /// Computes the waypoints by a closed loop on a copy of the pair.
-    fn rehearse_on_twin(
+    /// Computes the waypoints by a closed loop on a copy of the pair with `friction` times its friction.
+    pub(super) fn rehearse_on_copy(
         &self,
         start: &TrialStart,
         at: &[Joints],
-        number: u64,
+        friction: f32,
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let pair = self.pair(start, at, number, &copy_of(&self.config.simulated, TWIN_FRICTION));
+        let pair = self.pair(start, at, start.number, &copy_of(&self.config.simulated, friction));
         let mut observer = NoObserver;
         let mut rig =
             TrialRig::new(self.mapping.cell().clone(), pair, Goals::default(), &mut observer)?;
