@@ -1,4 +1,4 @@
-//! Motions that also succeed on copies of the pair.
+//! Copies of the pair, on which blind motions are rehearsed and tried.
 //!
 //! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. A blind
 //! motion is therefore executed on copies of the pair before one is chosen. The copies have no noise, and none of them has
@@ -13,7 +13,7 @@ use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{Goals, TrialRig};
 use crate::trial::robustness::USED_TOLERANCE;
 use crate::trial::runner::TrialRunner;
-use crate::trial::{NoObserver, TrialError};
+use crate::trial::{ActionSource, NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
 pub(super) const FRICTIONS: [f32; 4] = [0.8, 1.2, 0.9, 1.1];
@@ -45,21 +45,58 @@ impl TrialRunner {
         planned: &PlannedMotion,
         friction: f32,
     ) -> Result<bool, TrialError> {
-        let simulated = copy_of(&self.config.simulated, friction);
-        let pair = self.pair(start, at, start.number, &simulated);
-        let initial = pair.objects();
-        let (cell, mut observer) = (self.mapping.cell().clone(), NoObserver);
-        let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer)?;
-        let execution = self.open_loop(&mut rig, start, planned.clone());
-        let report = self.report(start.number, start, &initial, &rig, execution);
+        let report = self.on_copy(start, at, friction, |rig| {
+            let initial = rig.pair().objects();
+            let execution = self.open_loop(rig, start, planned.clone());
+            self.report(start.number, start, &initial, rig, execution)
+        })?;
         let near_m = USED_TOLERANCE * self.tolerance_m();
         let is_near = |object: &ObjectResult| object.end.distance(object.goal) <= near_m;
         Ok(report.cause.is_none() && report.objects.iter().all(is_near))
     }
+
+    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction.
+    pub(super) fn rehearse_on_copy(
+        &self,
+        start: &TrialStart,
+        at: &[Joints],
+        friction: f32,
+        policy: &mut dyn ActionSource,
+    ) -> Result<PlannedMotion, TrialError> {
+        let (execution, ends) = self.on_copy(start, at, friction, |rig| {
+            let execution = self.closed_loop(rig, start, at, policy);
+            (execution, rig.pair().objects())
+        })?;
+        let (waypoints, motion) = match execution.ended {
+            Ok(()) => self.blind_motion(execution.waypoints, at),
+            Err(cause) => (Vec::new(), Err(cause)),
+        };
+        Ok(PlannedMotion {
+            waypoints,
+            motion,
+            rehearsed_m: self.goal_distances_m(&ends, start),
+            n_steps: execution.n_steps,
+        })
+    }
+
+    /// Executes `run` on a copy of the pair at the start of the trial.
+    fn on_copy<T>(
+        &self,
+        start: &TrialStart,
+        at: &[Joints],
+        friction: f32,
+        run: impl FnOnce(&mut TrialRig<'_>) -> T,
+    ) -> Result<T, TrialError> {
+        let simulated = copy_of(&self.config.simulated, friction);
+        let pair = self.pair(start, at, start.number, &simulated);
+        let (cell, mut observer) = (self.mapping.cell().clone(), NoObserver);
+        let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer)?;
+        Ok(run(&mut rig))
+    }
 }
 
 /// Returns the configuration of a copy: the pair without noise and latency, and with `friction` times its friction.
-pub(super) fn copy_of(simulated: &SimulatedConfig, friction: f32) -> SimulatedConfig {
+fn copy_of(simulated: &SimulatedConfig, friction: f32) -> SimulatedConfig {
     SimulatedConfig {
         latency_periods: [1, 1],
         angle_noise_rad: 0.0,

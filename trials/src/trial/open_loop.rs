@@ -16,8 +16,8 @@ use crate::trial::{ActionSource, TrialError};
 
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
-/// A rehearsal that fails in this many more variants of the training world than the best one is not tried on the copies of
-/// the pair.
+/// A rehearsal is tried on the copies of the pair if it fails in at most this many more variants of the training world than
+/// the best one.
 const VARIANTS_MARGIN: usize = 2;
 /// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of the
 /// training world.

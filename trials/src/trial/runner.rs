@@ -9,9 +9,7 @@ use tandem_kinematics::{
 use tandem_sim::SimError;
 
 use crate::simulated::{Block, ObjectPose, SimulatedConfig, SimulatedPair, single};
-use crate::trial::copies::copy_of;
 use crate::trial::mapping::Mapping;
-use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{
     FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
 };
@@ -19,8 +17,7 @@ use crate::trial::rehearsal::{Rehearsal, TrialStart};
 use crate::trial::rig::{Goals, TrialRig};
 use crate::trial::shared_object::placed;
 use crate::trial::{
-    ActionSource, NoObserver, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver,
-    TrialReport,
+    ActionSource, ObjectPositions, TrialConfig, TrialError, TrialMode, TrialObserver, TrialReport,
 };
 use tandem_bridge::work_cell::{check_settings, mico_cell_of};
 
@@ -202,32 +199,6 @@ impl TrialRunner {
             self.mapping.write_observation(&now, &now, numbers);
             (now.object - start.goals[arm.0]).length() <= self.tolerance_m()
                 && self.task.arm_meets_conditions(arm, &observation)
-        })
-    }
-
-    /// Computes the waypoints by a closed loop on a copy of the pair with `friction` times its friction.
-    pub(super) fn rehearse_on_copy(
-        &self,
-        start: &TrialStart,
-        at: &[Joints],
-        friction: f32,
-        policy: &mut dyn ActionSource,
-    ) -> Result<PlannedMotion, TrialError> {
-        let pair = self.pair(start, at, start.number, &copy_of(&self.config.simulated, friction));
-        let mut observer = NoObserver;
-        let mut rig =
-            TrialRig::new(self.mapping.cell().clone(), pair, Goals::default(), &mut observer)?;
-        let execution = self.closed_loop(&mut rig, start, at, policy);
-        let ends = rig.pair().objects();
-        let (waypoints, motion) = match execution.ended {
-            Ok(()) => self.blind_motion(execution.waypoints, at),
-            Err(cause) => (Vec::new(), Err(cause)),
-        };
-        Ok(PlannedMotion {
-            waypoints,
-            motion,
-            rehearsed_m: self.goal_distances_m(&ends, start),
-            n_steps: execution.n_steps,
         })
     }
 
