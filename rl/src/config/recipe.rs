@@ -63,7 +63,7 @@ impl RunConfig {
                 unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
                 share: match (tandem, is_shared(layout)) {
-                    (true, true) => 0.3,
+                    (true, true) => 0.1,
                     (true, false) => 0.5,
                     (false, _) => 1.0,
                 },
