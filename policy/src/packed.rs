@@ -11,7 +11,7 @@ use crate::mlp::MlpShape;
 /// Largest number of rows of a pass.
 pub(crate) const MAX_ROWS: usize = 32;
 /// Number of outputs computed side by side.
-const PANEL: usize = 32;
+const PANEL: usize = 64;
 
 /// The parameters of a layer, with outputs in groups of [`PANEL`]; the last group is padded with zeros.
 #[derive(Debug, Clone)]
@@ -72,13 +72,13 @@ impl PackedMlp {
     }
 
     #[inline(always)]
-    fn pass(&mut self, n_rows: usize) {
+    fn pass<S: Simd>(&mut self, simd: S, n_rows: usize) {
         for (layer_idx, layer) in self.layers.iter().enumerate() {
             if layer_idx > 0 {
                 std::mem::swap(&mut self.input, &mut self.output);
                 relu(&mut self.input[..n_rows * self.row_stride]);
             }
-            layer.apply(&self.input, &mut self.output, self.row_stride, n_rows);
+            layer.apply(simd, &self.input, &mut self.output, self.row_stride, n_rows);
         }
     }
 }
@@ -93,8 +93,8 @@ impl WithSimd for Pass<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        self.network.pass(self.n_rows);
+    fn with_simd<S: Simd>(self, simd: S) {
+        self.network.pass(simd, self.n_rows);
     }
 }
 
@@ -118,7 +118,14 @@ impl PackedLayer {
     }
 
     #[inline(always)]
-    fn apply(&self, input: &[f32], output: &mut [f32], row_stride: usize, n_rows: usize) {
+    fn apply<S: Simd>(
+        &self,
+        simd: S,
+        input: &[f32],
+        output: &mut [f32],
+        row_stride: usize,
+        n_rows: usize,
+    ) {
         let panels = self.weights.chunks_exact(self.n_input).zip(&self.biases);
         for (panel_idx, (weights, bias)) in panels.enumerate() {
             let column = panel_idx * PANEL;
@@ -127,18 +134,21 @@ impl PackedLayer {
                 let input = &input[row_idx * row_stride..];
                 let output = &mut output[row_idx * row_stride + column..];
                 row_idx += match n_rows - row_idx {
-                    1 => tile::<1>(weights, bias, input, output, row_stride),
-                    2 | 3 => tile::<2>(weights, bias, input, output, row_stride),
-                    _ => tile::<4>(weights, bias, input, output, row_stride),
+                    1 => tile::<S, 1, 4>(simd, weights, bias, input, output, row_stride),
+                    2 | 3 => tile::<S, 2, 4>(simd, weights, bias, input, output, row_stride),
+                    _ => tile::<S, 4, 2>(simd, weights, bias, input, output, row_stride),
                 };
             }
         }
     }
 }
 
-/// Computes one panel of outputs for `ROWS` rows and returns `ROWS`.
+/// Computes one panel of outputs for `ROWS` rows, `VECTORS` registers of each row at a time, and returns `ROWS`.
+///
+/// The registers are explicit, because the compiler leaves the sums of several rows in scalars.
 #[inline(always)]
-fn tile<const ROWS: usize>(
+fn tile<S: Simd, const ROWS: usize, const VECTORS: usize>(
+    simd: S,
     weights: &[[f32; PANEL]],
     bias: &[f32; PANEL],
     input: &[f32],
@@ -147,17 +157,22 @@ fn tile<const ROWS: usize>(
 ) -> usize {
     let rows: [&[f32]; ROWS] =
         std::array::from_fn(|row| &input[row * row_stride..][..weights.len()]);
-    let mut sums = [*bias; ROWS];
-    for (input_idx, weights) in weights.iter().enumerate() {
-        for (sums, row) in sums.iter_mut().zip(rows) {
-            let x = row[input_idx];
-            for (sum, weight) in sums.iter_mut().zip(weights) {
-                *sum = x.mul_add(*weight, *sum);
+    let (bias, _) = S::as_simd_f32s(bias);
+    for (group, bias) in bias.as_chunks::<VECTORS>().0.iter().enumerate() {
+        let mut sums = [*bias; ROWS];
+        for (input_idx, weights) in weights.iter().enumerate() {
+            let weights = S::as_simd_f32s(weights).0.as_chunks::<VECTORS>().0[group];
+            for (sums, row) in sums.iter_mut().zip(rows) {
+                let x = simd.splat_f32s(row[input_idx]);
+                for (sum, weight) in sums.iter_mut().zip(weights) {
+                    *sum = simd.mul_add_f32s(x, weight, *sum);
+                }
             }
         }
-    }
-    for (row, sums) in sums.iter().enumerate() {
-        output[row * row_stride..][..PANEL].copy_from_slice(sums);
+        for (row, sums) in sums.iter().enumerate() {
+            let (output, _) = S::as_mut_simd_f32s(&mut output[row * row_stride..][..PANEL]);
+            output.as_chunks_mut::<VECTORS>().0[group] = *sums;
+        }
     }
     ROWS
 }
@@ -171,6 +186,7 @@ fn relu(rows: &mut [f32]) {
 
 #[cfg(test)]
 mod tests {
+    use pulp::Scalar;
     use tandem_core::rng::uniform;
     use tandem_core::{Stream, episode_rng};
 
@@ -220,7 +236,7 @@ mod tests {
         let dispatched = outputs(&mut network, &rows, PackedMlp::run);
         assert_eq!(
             dispatched,
-            outputs(&mut network, &rows, PackedMlp::pass),
+            outputs(&mut network, &rows, |network, n_rows| network.pass(Scalar::new(), n_rows)),
             "baseline instructions"
         );
     }
