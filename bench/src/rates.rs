@@ -58,7 +58,8 @@ pub fn sim(clock: &Clock) -> Result<Vec<Figure>, Error> {
     Ok(figures)
 }
 
-/// Measures the time of one decision of the two-arm student, for one, two and eight episodes in lock step.
+/// Measures the time of one decision of the two-arm student, for one, two and eight episodes in lock step, and the ratio
+/// of an episode's time among eight to its time alone.
 ///
 /// # Errors
 /// When the default settings give no policy, which is a bug.
@@ -68,15 +69,20 @@ pub fn inference(clock: &Clock) -> Result<Vec<Figure>, Error> {
     let policy = trainer.policy(std::collections::BTreeMap::new());
     let mut actor = policy.actor()?;
     let layout = policy.layout;
-    let mut figures = Vec::new();
-    for n in [1, 2, 8] {
+    let mut decision_us = |n: usize| {
         let (observations, goals) =
             (vec![0.1; n * layout.n_observation()], vec![0.1; n * layout.n_goal()]);
         let mut actions = vec![0.0; n * layout.n_action()];
-        let per_s = rate(clock, || actor.act(&observations, &goals, &mut actions));
-        figures.push(Figure::new(format!("inference/student-actor/batch-{n}"), 1e6 / per_s, "us"));
-    }
-    Ok(figures)
+        1e6 / rate(clock, || actor.act(&observations, &goals, &mut actions))
+    };
+    let [one, two, eight] = [1, 2, 8].map(&mut decision_us);
+    let named = |suffix| format!("inference/student-actor/{suffix}");
+    Ok(vec![
+        Figure::new(named("batch-1"), one, "us"),
+        Figure::new(named("batch-2"), two, "us"),
+        Figure::new(named("batch-8"), eight, "us"),
+        Figure::new(named("batch-8-per-row-over-batch-1"), eight / 8.0 / one, "x batch-1"),
+    ])
 }
 
 /// Measures updates of the two-arm student per second with one, two, four and so on up to as many threads as the machine

@@ -24,7 +24,7 @@ pub enum Recipe {
 /// Environment steps of the paper's epoch: 50 rounds of 32 episodes of 50 steps (decision 005).
 const PAPER_EPOCH_ENV_STEPS: u64 = 80_000;
 
-/// Width of the hidden layers in both recipes.
+/// Width of the hidden layers, in both recipes; recipe `tandem` halves it for two arms in the world `shared`.
 const N_HIDDEN: usize = 256;
 
 impl RunConfig {
@@ -162,8 +162,8 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
         (Recipe::Tandem, Some(built_in)) if is_shared(layout) => {
             match (built_in.n_arms, built_in.task.grasps()) {
                 (1, false) => 100_000,
-                (1, true) => 200_000,
-                _ => 600_000,
+                (1, true) | (_, false) => 200_000,
+                (_, true) => 400_000,
             }
         }
         (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
@@ -235,11 +235,12 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
 
 fn ddpg(recipe: Recipe, layout: &TaskSpec) -> DdpgConfig {
     let (tandem, n_arms) = (recipe == Recipe::Tandem, layout.n_arms());
+    let pair_shares_table = tandem && n_arms > 1 && is_shared(layout);
     DdpgConfig {
-        n_hidden: N_HIDDEN,
+        n_hidden: if pair_shares_table { N_HIDDEN / 2 } else { N_HIDDEN },
         n_hidden_layers: n_hidden_layers(n_arms),
         discount: if tandem { 0.95 } else { 0.98 },
-        final_discount: if tandem && carries_past_others(layout) { 0.98 } else { 0.0 },
+        final_discount: if pair_shares_table { 0.98 } else { 0.0 },
         action_penalty: if tandem { 0.1 } else { 1.0 },
         bc_weight: if tandem && n_arms > 1 { 2.0 } else { 0.0 },
         cooldown_share: if tandem { 0.2 } else { 0.0 },
