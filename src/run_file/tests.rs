@@ -154,9 +154,9 @@ fn a_time_limit_replaces_the_recipes_number_of_steps() {
         let stop = resolved(settings).expect("valid").stop;
         (stop.max_env_steps, stop.max_minutes)
     };
-    assert_eq!(limits(&[]), (600_000, 0.0));
+    assert_eq!(limits(&[]), (200_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5"]), (0, 5.0));
-    assert_eq!(limits(&["stop.max_minutes=0"]), (600_000, 0.0));
+    assert_eq!(limits(&["stop.max_minutes=0"]), (200_000, 0.0));
     assert_eq!(limits(&["stop.max_minutes=5", "stop.max_env_steps=100"]), (100, 5.0));
 }
 
@@ -188,7 +188,10 @@ fn the_file_of_an_earlier_version_is_completed_for_comparisons() {
         former[section].as_table_mut().expect("a section").remove(name);
     }
     let mut expected = config.clone();
+    expected.world.grasped_start_env_steps = 0;
     expected.replay.reflection_prob = 0.0;
+    expected.replay.displaced_hindsight = false;
+    expected.ddpg.cooldown_share = 0.0;
     expected.evaluation.early_points = 0;
     expected.evaluation.symmetrized = false;
     let completed = completed(&former.to_string()).expect("valid");

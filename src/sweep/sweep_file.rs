@@ -32,6 +32,8 @@ struct SweepFile {
     variant: Option<Vec<Variant>>,
     /// Settings of all runs, as in a run file.
     run: Table,
+    /// Settings of the runs of a task in `tasks`, which override `[run]`.
+    per_task: BTreeMap<String, Table>,
     /// Teacher policy files by task; the default is the shipped teacher.
     teachers: BTreeMap<String, PathBuf>,
     /// The server of the environments of all runs, as the options of `tandem train`.
@@ -130,7 +132,8 @@ fn names_task(file: &SweepFile) -> bool {
 /// seed of every combination. `of_server` describes the task if the file does not name one.
 fn runs(file: &SweepFile, of_server: &[(String, Value)]) -> anyhow::Result<Vec<PlannedRun>> {
     let base = [of_server, &flattened(&file.run)].concat();
-    let (tasks, seeds) = (tasks(file), choices("seed", listed(&file.seeds).iter().map(seed_value)));
+    let (tasks, seeds) =
+        (tasks(file)?, choices("seed", listed(&file.seeds).iter().map(seed_value)));
     let (columns, axes) = (columns(file, &base)?, axes(file)?);
     let n_runs = [tasks.len(), seeds.len(), columns.len(), axes.len()].iter().product::<usize>();
     ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs: expected at most {MAX_RUNS}");
@@ -212,8 +215,17 @@ fn listed<T>(list: &Option<Vec<T>>) -> &[T] {
     list.as_deref().unwrap_or_default()
 }
 
-fn tasks(file: &SweepFile) -> Vec<Choice> {
-    choices("task", listed(&file.tasks).iter().cloned().map(Value::String))
+/// Returns the tasks, each with its own settings.
+fn tasks(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
+    let tasks = listed(&file.tasks);
+    if let Some(task) = file.per_task.keys().find(|task| !tasks.contains(task)) {
+        bail!("[per_task.{task}]: expected a task that `tasks` lists");
+    }
+    let mut choices = choices("task", tasks.iter().cloned().map(Value::String));
+    for (choice, task) in choices.iter_mut().zip(tasks) {
+        choice.settings.extend(file.per_task.get(task).map(flattened).unwrap_or_default());
+    }
+    Ok(choices)
 }
 
 /// Returns a choice for each value of `key`, or one without settings if there are no values.

@@ -20,17 +20,23 @@ pub const REMOVED: [&str; 2] = ["world.wide_start_share", "replay.advised_share"
 
 /// Settings that earlier versions did not have, and the values that mean what those versions did, as JSON and TOML. A
 /// file with all settings of an earlier version, and a checkpoint, have these values where they have none.
-pub const ADDED: [(&str, &str); 14] = [
+pub const ADDED: [(&str, &str); 20] = [
     ("advice.budget_scope", "\"run\""),
     ("advice.unit", "\"env-step\""),
     ("advice.judged_action", "\"executed\""),
     ("rounds.per_epoch", "50"),
     ("rounds.final_greedy_share", "0.0"),
     ("exploration.joint_random_actions", "false"),
+    ("world.grasped_start_env_steps", "0"),
+    ("world.randomization", "0.0"),
     ("replay.joint_goal_statistics", "false"),
+    ("replay.displaced_hindsight", "false"),
+    ("replay.contact_cost_growth", "1.0"),
     ("replay.reflection_prob", "0.0"),
     ("replay.coda_contact_prob", "0.0"),
     ("ddpg.batches_per_update", "1"),
+    ("ddpg.cooldown_share", "0.0"),
+    ("ddpg.final_discount", "0.0"),
     ("ddpg.bc_final_fraction", "1.0"),
     ("ddpg.bc_filter_start", "1.0"),
     ("evaluation.early_points", "0"),

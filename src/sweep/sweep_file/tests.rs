@@ -52,6 +52,23 @@ fn variants_are_added_to_strategies_and_axes_multiply_both() {
 }
 
 #[test]
+fn settings_of_a_task_override_those_of_all_runs_and_a_variant_overrides_both() {
+    let text = "tasks = [\"push\", \"pick-and-place\"]\n[[variant]]\nname = \"a\"\n\
+                [[variant]]\nname = \"b\"\nset = { ddpg.discount = 0.97 }\n\
+                [run]\nddpg.discount = 0.95\n[per_task.push]\nddpg.discount = 0.96\n";
+    let runs = runs_of(text).expect("valid");
+    let discounts: Vec<_> =
+        runs.iter().map(|run| (run.name.as_str(), run.config.ddpg.discount)).collect();
+    let expected = [
+        ("push-a-seed1", 0.96),
+        ("push-b-seed1", 0.97),
+        ("pick-and-place-a-seed1", 0.95),
+        ("pick-and-place-b-seed1", 0.97),
+    ];
+    assert_eq!(discounts, expected);
+}
+
+#[test]
 fn runs_have_no_time_limit_unless_one_is_set() {
     let minutes = |text: &str| runs_of(text).expect("valid")[0].config.stop.max_minutes;
     assert_eq!(minutes(LIMIT), 0.0);
@@ -90,6 +107,7 @@ fn errors_fit_on_one_line() {
         check(&format!("{key} = []"), &[key, "is an empty list"]);
     }
     check("[[variant]]\nname = \"a/b\"", &["a/b"]);
+    check("tasks = [\"push\"]\n[per_task.fold]\nseed = 2", &["[per_task.fold]", "`tasks`"]);
     check("strategies = [\"ea\"]\n[run.advice]\nstrategy = \"none\"", &["advice.strategy"]);
     let unlimited =
         runs_of("[run.stop]\nmax_env_steps = 0").expect_err("must be refused").to_string();
