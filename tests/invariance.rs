@@ -20,9 +20,11 @@ const EAMC: (&str, u64) = ("eamc:0.1", 810);
 const JSRL: (&str, u64) = ("jsrl:20", 400);
 const N_WORKERS: [usize; 4] = [1, 2, 5, 16];
 /// Eight rounds of sixteen slots, so that sixteen workers have something to do; the policy is evaluated after each.
-const SMALL: [&str; 24] = [
+const SMALL: [&str; 26] = [
     "--max-env-steps",
     "6400",
+    "--set",
+    "advice.share=0.3",
     "--set",
     "world.substeps=10",
     "--set",
