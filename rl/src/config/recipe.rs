@@ -63,7 +63,9 @@ impl RunConfig {
                 unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
                 share: match (tandem, is_shared(layout)) {
-                    (true, true) => 0.1,
+                    // Pick and place takes twice as many steps.
+                    (true, true) if carries_past_others(layout) => 0.1,
+                    (true, true) => 0.2,
                     (true, false) => 0.5,
                     (false, _) => 1.0,
                 },
