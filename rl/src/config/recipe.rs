@@ -63,7 +63,7 @@ impl RunConfig {
                 unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
                 share: match (tandem, is_shared(layout)) {
-                    // Pick and place takes twice as many steps.
+                    // Of twice as many episodes as in push, half the share is as many advised ones.
                     (true, true) if carries_past_others(layout) => 0.1,
                     (true, true) => 0.2,
                     (true, false) => 0.5,
