@@ -74,8 +74,8 @@ for name in teacher-push student-push teacher-pick-and-place student-pick-and-pl
   file=policies/$name.safetensors
   "$tandem" policy export "$file" --onnx "$work/actor.onnx" --critic-onnx "$work/critic.onnx" >/dev/null
   cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- "$file" 1000 >"$work/probe.json"
-  "$tandem" eval --policy "$file" --episodes 20 --record-dir "$work/$name" >/dev/null
-  "$work/venv/bin/python" scripts/check_onnx.py "$work/actor.onnx" "$work/critic.onnx" "$work/probe.json" "$work/$name"
+  "$tandem" eval --policy "$file" --episodes 200 --record-dir "$work/$name" >/dev/null
+  "$work/venv/bin/python" scripts/check_onnx.py "$file" "$work/actor.onnx" "$work/critic.onnx" "$work/probe.json" "$work/$name"
   "$tandem" policy import "$work/actor.onnx" --critic "$work/critic.onnx" --out "$work/back.safetensors" >/dev/null
   digest() { "$tandem" policy show "$1" --json | python3 -c 'import json, sys; print(json.load(sys.stdin)["digest"])'; }
   [ "$(digest "$file")" = "$(digest "$work/back.safetensors")" ] || { echo "$name changed by export and import"; exit 1; }
