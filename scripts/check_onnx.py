@@ -28,8 +28,8 @@ import check_policy
 
 SIMULATED_RMS = 1e-6
 SIMULATED_TOLERANCE = 1e-5
-SIMULATED_SHARE = 0.001
-ARBITRARY_TOLERANCE = 1e-4
+SIMULATED_SHARE_APART = 0.001
+LARGEST_DIFFERENCE = 1e-4
 
 
 def session(path):
@@ -75,10 +75,10 @@ def compare_simulated(what, got, expected):
     print(f"{what}: root mean square {rms:.1e}, largest difference {largest:.1e}; {apart}")
     if not rms < SIMULATED_RMS:
         sys.exit(f"{what}: the root mean square is {SIMULATED_RMS:.0e} or more")
-    if n_apart > SIMULATED_SHARE * n_rows:
+    if n_apart > SIMULATED_SHARE_APART * n_rows:
         sys.exit(f"{what}: {apart}")
-    if not largest < ARBITRARY_TOLERANCE:
-        sys.exit(f"{what}: differences of {ARBITRARY_TOLERANCE:.0e} or more")
+    if not largest < LARGEST_DIFFERENCE:
+        sys.exit(f"{what}: differences of {LARGEST_DIFFERENCE:.0e} or more")
 
 
 def exact_actions(policy_path, observations, goals):
@@ -98,11 +98,11 @@ def main(policy_path, actor_path, critic_path, probe_path, log_directory):
 
     observations, goals, actions, values = probe_rows(probe_path)
     states = {"observation": observations, "goal": goals}
-    compare("actions in arbitrary states", actor.run(["action"], states)[0], actions, ARBITRARY_TOLERANCE)
+    compare("actions in arbitrary states", actor.run(["action"], states)[0], actions, LARGEST_DIFFERENCE)
     got = critic.run(["value"], states | {"action": actions})[0]
-    compare("values of these actions", got, values, ARBITRARY_TOLERANCE)
+    compare("values of these actions", got, values, LARGEST_DIFFERENCE)
     one = {name: rows[:1] for name, rows in states.items()}
-    compare("actions of a batch of one", actor.run(["action"], one)[0], actions[:1], ARBITRARY_TOLERANCE)
+    compare("actions of a batch of one", actor.run(["action"], one)[0], actions[:1], LARGEST_DIFFERENCE)
     observations, goals, actions = log_rows(log_directory)
     states = {"observation": observations, "goal": goals}
     got, exact = actor.run(["action"], states)[0], exact_actions(policy_path, observations, goals)

@@ -70,8 +70,8 @@ python3 -m venv "$work/venv"
 "$work/venv/bin/python" scripts/read_mcap.py "$work"/run/mcap/*.mcap
 cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- policies/teacher-push.safetensors >"$work/probe.json"
 "$work/venv/bin/python" scripts/check_policy.py policies/teacher-push.safetensors "$work/probe.json"
-for name in {teacher,student}-{push,pick-and-place} student-{push,pick-and-place}-classic; do
-  file=policies/$name.safetensors
+for file in policies/*.safetensors; do
+  name=$(basename "$file" .safetensors)
   "$tandem" policy export "$file" --onnx "$work/actor.onnx" --critic-onnx "$work/critic.onnx" >/dev/null
   cargo run --release --locked --quiet -p tandem-policy --example policy_probe -- "$file" 1000 >"$work/probe.json"
   "$tandem" eval --policy "$file" --episodes 200 --record-dir "$work/$name" >/dev/null
