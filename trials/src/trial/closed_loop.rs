@@ -19,6 +19,7 @@ use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 mod episodes;
+mod order;
 mod sparing;
 mod squeezing;
 mod yielding;

@@ -1,8 +1,8 @@
 //! Episodes of a trial in the closed loop.
 //!
 //! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
-//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms that block each other
-//! take turns.
+//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms that would
+//! be in each other's way ([`super::order`]) or block each other take turns.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
@@ -74,6 +74,7 @@ impl TrialRunner {
     ) -> Result<(), FailureCause> {
         let time_limit_s = self.config.time_limit_s / self.config.speed;
         let (mut n_in_episode, mut n_blocked) = (0, 0_usize);
+        self.order_arms(rig, start, state)?;
         loop {
             if state.n_done == DONE_OBSERVATIONS {
                 rig.wait(REST_S)?;
@@ -157,7 +158,7 @@ impl TrialRunner {
         }
     }
 
-    /// Withdraws the arms whose objects are not at their goals.
+    /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
     fn start_next_episode(
         &self,
         rig: &mut TrialRig<'_>,
@@ -170,7 +171,7 @@ impl TrialRunner {
         state.before = None;
         let seed = self.config.seed;
         state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
-        Ok(())
+        self.order_arms(rig, start, state)
     }
 
     /// Returns the arms that are not parked and whose objects are not `misplaced` and lie on the table.
@@ -186,7 +187,7 @@ impl TrialRunner {
 
     /// Opens the grippers of the `retreating` arms, raises their hands and withdraws them toward their bases, as far as
     /// the check allows.
-    fn retreat(
+    pub(super) fn retreat(
         &self,
         rig: &mut TrialRig<'_>,
         state: &mut LoopState,
@@ -223,7 +224,11 @@ impl TrialRunner {
     }
 
     /// Returns for each arm whether its object is away from its goal.
-    fn misplaced(&self, objects: &[ObjectPose], start: &TrialStart) -> impl Iterator<Item = bool> {
+    pub(super) fn misplaced(
+        &self,
+        objects: &[ObjectPose],
+        start: &TrialStart,
+    ) -> impl Iterator<Item = bool> {
         let near_m = DONE_SHARE * self.tolerance_m();
         self.goal_distances_m(objects, start).into_iter().map(move |distance_m| distance_m > near_m)
     }

@@ -1,0 +1,117 @@
+//! The order in which two arms push their objects.
+//!
+//! Objects that are pushed at the same time can meet, and one of them ends where no hand gets behind it. If an object or a
+//! goal is in the way, one arm therefore waits from the start. The starts of the shared world are drawn so that at least one
+//! order leaves both ways free.
+
+use glam::DVec2;
+use tandem_core::ArmIndex;
+
+use super::LoopState;
+use crate::trial::outcome::FailureCause;
+use crate::trial::rehearsal::TrialStart;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::TrialRunner;
+
+/// The horizontal distance from the way of an object below which another object is in its way, metres.
+const CLEARANCE_M: f64 = 0.10;
+/// An arm waits only where its hand is within this distance of its place, metres; elsewhere it could block the other one.
+const WITHDRAWN_WITHIN_M: f64 = 0.05;
+
+/// The straight way of an object to its goal, seen from above, world frame, metres.
+#[derive(Debug, Clone, Copy)]
+struct Way {
+    from: DVec2,
+    to: DVec2,
+}
+
+impl TrialRunner {
+    /// Withdraws the arm that has to wait until the other one's object lies at its goal, if one has to.
+    pub(super) fn order_arms(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        state: &mut LoopState,
+    ) -> Result<(), FailureCause> {
+        // Hands that grasp lift their objects over others.
+        if self.task.shares_object() || self.config.layout.task.grasps() {
+            return Ok(());
+        }
+        let objects = rig.observe_objects()?;
+        if !self.misplaced(&objects, start).all(|misplaced| misplaced) {
+            return Ok(());
+        }
+        let ways = objects.iter().zip(&start.goals).enumerate().map(|(arm, (object, goal))| {
+            let to = self.mapping.object_in_world(ArmIndex(arm), *goal);
+            Way { from: object.at_m.truncate(), to: to.truncate() }
+        });
+        let ways: Vec<Way> = ways.collect();
+        let Some(waiting) = waiting_arm(&ways) else { return Ok(()) };
+        let place = self.mapping.withdrawn_hand(self.hands(state)[waiting]);
+        let waits: Vec<bool> = (0..ways.len()).map(|arm| arm == waiting).collect();
+        self.retreat(rig, state, &waits)?;
+        state.before = None;
+        if self.hands(state)[waiting].distance(place) < WITHDRAWN_WITHIN_M {
+            state.parked = waits;
+        }
+        Ok(())
+    }
+}
+
+/// Returns the arm whose object is to be pushed last, or `None` if the order does not matter.
+fn waiting_arm(ways: &[Way]) -> Option<usize> {
+    let [one, other] = ways else { return None };
+    let (one_m, other_m) = (one.room_m(other), other.room_m(one));
+    (one_m.min(other_m) < CLEARANCE_M).then_some(usize::from(one_m >= other_m))
+}
+
+impl Way {
+    /// Returns the distance that objects keep if this one goes first: its own from the `second` one on the way, and at its
+    /// goal from the way of the `second` one.
+    fn room_m(&self, second: &Self) -> f64 {
+        self.distance_m(second.from).min(second.distance_m(self.to))
+    }
+
+    fn distance_m(&self, point: DVec2) -> f64 {
+        let along = self.to - self.from;
+        let offset = point - self.from;
+        let share = offset.dot(along) / along.length_squared().max(f64::MIN_POSITIVE);
+        offset.distance(along * share.clamp(0.0, 1.0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn way(from: [f64; 2], to: [f64; 2]) -> Way {
+        Way { from: from.into(), to: to.into() }
+    }
+
+    #[test]
+    fn arms_with_free_ways_do_not_wait() {
+        let ways = [way([0.0, 0.1], [0.2, 0.1]), way([0.2, -0.1], [0.0, -0.1])];
+        assert_eq!(waiting_arm(&ways), None);
+    }
+
+    #[test]
+    fn an_arm_waits_for_an_object_in_its_way() {
+        let through = way([0.0, 0.0], [0.2, 0.0]);
+        let aside = way([0.1, 0.05], [0.1, 0.2]);
+        assert_eq!(waiting_arm(&[through, aside]), Some(0));
+        assert_eq!(waiting_arm(&[aside, through]), Some(1));
+    }
+
+    #[test]
+    fn an_arm_waits_if_its_goal_is_in_the_way_of_the_other_object() {
+        let stays = way([0.1, 0.2], [0.1, 0.02]);
+        let passes = way([-0.1, 0.0], [0.3, 0.0]);
+        assert_eq!(waiting_arm(&[stays, passes]), Some(0));
+    }
+
+    #[test]
+    fn an_object_at_its_goal_has_a_way_of_no_length() {
+        let placed = way([0.0, 0.0], [0.0, 0.0]);
+        assert_eq!(placed.distance_m(DVec2::new(0.03, 0.04)), 0.05);
+    }
+}
