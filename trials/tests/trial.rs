@@ -3,6 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Contacts, Layout, Task};
 use tandem_policy::{Actor, Policy};
@@ -70,6 +71,47 @@ fn a_hand_that_would_press_on_its_block_continues() {
     );
 }
 
+/// Returns the smallest horizontal distance of `point` from 100 points of the way from `from` to `to`, metres.
+fn distance_to_way_m(point: DVec3, from: DVec3, to: DVec3) -> f64 {
+    let part = |step: u32| from.lerp(to, f64::from(step) / 100.0) - point;
+    (0..=100).map(|step| part(step).truncate().length()).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn one_arm_waits_where_pushed_objects_could_meet() {
+    let mut trials = TrialRunner::new(TrialConfig {
+        // Shorter than an episode, after which all arms withdraw.
+        time_limit_s: 2.0,
+        ..config(Task::SharedPush, TrialMode::ClosedLoop, 1)
+    })
+    .unwrap();
+    let mut idle = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.0);
+    let mut n_waiting = 0;
+    for number in 0..12 {
+        let report = trials.run(number, &mut idle, &mut NoObserver).unwrap();
+        let room_m = |first: usize| {
+            let (one, other) = (&report.positions[first], &report.positions[1 - first]);
+            distance_to_way_m(other.start, one.start, one.goal).min(distance_to_way_m(
+                one.goal,
+                other.start,
+                other.goal,
+            ))
+        };
+        let moved = |arm: usize| {
+            let ends = [&report.path[0], &report.path[report.path.len() - 1]];
+            let [start, end] = ends.map(|point| point.measured[arm]);
+            (end - start).length() > 0.05
+        };
+        let (one_m, other_m) = (room_m(0), room_m(1));
+        let could_meet = one_m.min(other_m) < 0.10;
+        // The order with more room is taken: the arm that goes first stays where it is, because its policy is idle.
+        let expected = [could_meet && one_m < other_m, could_meet && one_m >= other_m];
+        assert_eq!([moved(0), moved(1)], expected, "trial {number}: {one_m} {other_m}");
+        n_waiting += usize::from(could_meet);
+    }
+    assert!((1..12).contains(&n_waiting), "{n_waiting} of 12 trials need an order");
+}
+
 /// Returns the shipped student of push, which does nothing in its first `n_episodes` episodes.
 fn idle_at_first(n_episodes: usize) -> impl FnMut(&[f32], &[f32], &mut [f32]) {
     let mut actor = shipped("student-push-classic.safetensors");
@@ -135,7 +177,7 @@ fn two_arms_carry_one_object_together() {
         assert_eq!(report.cause, None, "trial {number}");
         assert_eq!(report.touched, Contacts::NONE);
         assert!(report.arms_gap_m > 0.0 && report.table_gap_m > 0.0);
-        let apart_m = |point: fn(&ObjectPositions) -> glam::DVec3| {
+        let apart_m = |point: fn(&ObjectPositions) -> DVec3| {
             point(&report.positions[0]).distance(point(&report.positions[1]))
         };
         assert!((apart_m(|object| object.start) - 0.32).abs() < 1e-3);
