@@ -1,8 +1,8 @@
 //! Episodes of a trial in the closed loop.
 //!
 //! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
-//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms that would
-//! be in each other's way ([`super::order`]) or block each other take turns.
+//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns if their
+//! objects could meet ([`super::order`]) or if they block each other.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};

@@ -1,8 +1,8 @@
 //! The order in which two arms push their objects.
 //!
-//! Objects that are pushed at the same time can meet, and one of them ends where no hand gets behind it. If an object or a
-//! goal is in the way, one arm therefore waits from the start. The starts of the shared world are drawn so that at least one
-//! order leaves both ways free.
+//! Objects that are pushed at the same time can meet, and one can end where no hand gets behind it. One arm therefore waits
+//! from the start of an episode if an object or a goal lies in the way of the other object. The starts of the shared world
+//! leave both ways free in at least one order.
 
 use glam::DVec2;
 use tandem_core::ArmIndex;
@@ -15,7 +15,7 @@ use crate::trial::runner::TrialRunner;
 
 /// The horizontal distance from the way of an object below which another object is in its way, metres.
 const CLEARANCE_M: f64 = 0.10;
-/// An arm waits only where its hand is within this distance of its place, metres; elsewhere it could block the other one.
+/// The distance from the withdrawn position within which a hand can wait, metres. Elsewhere it could block the other arm.
 const WITHDRAWN_WITHIN_M: f64 = 0.05;
 
 /// The straight way of an object to its goal, seen from above, world frame, metres.
@@ -26,7 +26,8 @@ struct Way {
 }
 
 impl TrialRunner {
-    /// Withdraws the arm that has to wait until the other one's object lies at its goal, if one has to.
+    /// Withdraws and parks the arm whose object is to be pushed last, if the order matters. Its turn comes when the other
+    /// object lies at its goal.
     pub(super) fn order_arms(
         &self,
         rig: &mut TrialRig<'_>,
@@ -66,12 +67,12 @@ fn waiting_arm(ways: &[Way]) -> Option<usize> {
 }
 
 impl Way {
-    /// Returns the distance that objects keep if this one goes first: its own from the `second` one on the way, and at its
-    /// goal from the way of the `second` one.
+    /// Returns the smallest distance between the objects, metres, if this one is pushed first and the `second` one after it.
     fn room_m(&self, second: &Self) -> f64 {
         self.distance_m(second.from).min(second.distance_m(self.to))
     }
 
+    /// Returns the distance of `point` from the nearest point of the way, metres.
     fn distance_m(&self, point: DVec2) -> f64 {
         let along = self.to - self.from;
         let offset = point - self.from;
