@@ -312,7 +312,7 @@ def wilson(hits, n):
 
 
 def collect(options):
-    """Copies the small files of all pieces."""
+    """Copies the small files of all pieces, without the paths of this machine."""
     if not options.runs.is_dir():
         sys.exit(f"benchmarks: no pieces in {options.runs}")
     small = ("metrics.jsonl", "run.toml", "summary.json", "processor.csv", "progress.csv")
@@ -324,6 +324,11 @@ def collect(options):
         target.mkdir(parents=True, exist_ok=True)
         for file in files:
             shutil.copy(file, target / file.name)
+        summary = target / "summary.json"
+        if summary.is_file():
+            content = json.loads(summary.read_text(encoding="utf-8"))
+            kept = {key: value for key, value in content.items() if key not in ("run_dir", "policy")}
+            summary.write_text(json.dumps(kept) + "\n", encoding="utf-8")
         print(target.relative_to(ROOT))
 
 
