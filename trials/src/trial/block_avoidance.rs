@@ -1,10 +1,10 @@
 //! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
 //! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
-//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, a little higher if
-//! its pads would graze the block, and stays just above a block that its pads would touch. A hand beside a block moves
-//! down first and then sideways, because pads that descend along a block's side press it onto the table. A hand that
-//! holds a block lowers it to the table and no further.
+//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, raised before if its
+//! pads or the block that they hold would graze the other block, and stays just above a block that these would touch. A
+//! hand beside a block moves down first and then sideways, because pads that descend along a block's side press it onto
+//! the table. A hand that holds a block lowers it to the table and no further.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -17,6 +17,8 @@ const ABOVE_M: f64 = 0.004;
 const HELD_WITHIN_M: f64 = 0.025;
 /// The number of parts of a step at whose ends pads are compared with a block.
 const N_PARTS: u32 = 8;
+/// A hand that ends this far above where it wants to be is held up, metres.
+const HELD_UP_M: f64 = 0.01;
 /// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
 const SET_DOWN_M: f64 = 0.002;
 
@@ -41,6 +43,17 @@ pub(crate) struct Pads {
     pub(crate) axes: DMat3,
     /// The opening of each side, metres.
     pub(crate) opening_m: f64,
+    /// The commanded opening of each side, metres. It is smaller if the pads hold something.
+    pub(crate) commanded_m: f64,
+}
+
+/// The path of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Way {
+    /// Two corners and the end of the path of the point between the pads, world frame, metres.
+    pub(crate) points: [DVec3; 3],
+    /// Whether a block keeps the hand from where it wants to be.
+    pub(crate) is_held_up: bool,
 }
 
 /// Returns `to`, but no lower than the blocks that pads at `from` hold can be lowered; world frame, metres.
@@ -49,34 +62,48 @@ pub(crate) fn lowered(from: &Pads, to: DVec3, blocks: &[ObservedBlock]) -> DVec3
     to.with_z(to.z.max(from.centre.z - room_m.fold(f64::INFINITY, f64::min)))
 }
 
-/// Returns the path of the point between the pads from `from` towards `to`, world frame, metres: a corner and the end.
-pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> [DVec3; 2] {
+/// Returns the path of the point between the pads from `from` towards `to`.
+pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> Way {
     let start = from.centre;
     let to = Pads { centre: lowered(from, to.centre, blocks), ..*to };
     let end = to.centre;
+    let free = |corner| Way { points: [start, corner, end], is_held_up: false };
     if end.z >= start.z {
-        return [start.midpoint(end), end];
+        return free(start.midpoint(end));
     }
+    let (held, others): (Vec<ObservedBlock>, Vec<_>) =
+        blocks.iter().partition(|block| from.hold(block));
+    let moved =
+        |block: &ObservedBlock| (Body::at(block, DVec3::ZERO), Body::at(block, end - start));
+    let pads = from.each().into_iter().zip(to.each());
+    let bodies: Vec<(Body, Body)> = pads.chain(held.iter().map(moved)).collect();
     let mut is_above = false;
     let mut lowest_m = f64::NEG_INFINITY;
     let mut lift_m = 0.0_f64;
-    for block in blocks.iter().filter(|block| from.crosses(&to, block)) {
+    let is_met = |block: &&ObservedBlock| {
+        from.crosses(&to, block) || bodies[2..].iter().any(|(one, then)| one.crosses(then, block))
+    };
+    for block in others.iter().filter(is_met) {
         let over_m = block.top_m() + ABOVE_M;
-        let pads = from.each().into_iter().zip(to.each());
-        for (before, after) in pads.filter(|(before, _)| before.is_above(block)) {
-            is_above = true;
-            lift_m = lift_m.max(over_m - before.lowest_m());
-            if after.overlaps(block) {
-                lowest_m = lowest_m.max(over_m + end.z - after.lowest_m());
+        let any_above = bodies.iter().any(|(before, _)| before.is_above(block));
+        for (before, after) in &bodies {
+            let crosses = || any_above && !before.overlaps(block) && before.crosses(after, block);
+            if before.is_above(block) || crosses() {
+                is_above = true;
+                lift_m = lift_m.max(over_m - before.lowest_m());
+                if after.overlaps(block) {
+                    lowest_m = lowest_m.max(over_m + end.z - after.lowest_m());
+                }
             }
         }
     }
     if !is_above {
-        return [start.with_z(end.z), end];
+        return free(start.with_z(end.z));
     }
     let highest_m = start.z + lift_m;
-    let end = end.with_z(end.z.max(lowest_m.min(highest_m)));
-    [end.with_z(highest_m), end]
+    let last = end.with_z(end.z.max(lowest_m.min(highest_m)));
+    let points = [start.with_z(highest_m), last.with_z(highest_m), last];
+    Way { points, is_held_up: last.z > end.z + HELD_UP_M }
 }
 
 impl ObservedBlock {
@@ -95,7 +122,7 @@ impl Pads {
     fn hold(&self, block: &ObservedBlock) -> bool {
         let offset = block.at - self.centre;
         let longer_m = (block.half_m.x - block.half_m.y).max(0.0);
-        self.opening_m <= block.half_m.y
+        self.commanded_m <= block.half_m.y
             && offset.truncate().length() < HELD_WITHIN_M + longer_m
             && offset.z.abs() < block.half_m.z
     }
@@ -103,30 +130,37 @@ impl Pads {
     /// Returns whether a pad, or what is between the pads, overlaps `block`, seen from above, on the way to `to`.
     fn crosses(&self, to: &Self, block: &ObservedBlock) -> bool {
         (0..=N_PARTS).any(|part| {
-            let share = f64::from(part) / f64::from(N_PARTS);
-            let centre = self.centre.lerp(to.centre, share);
-            let between = Pad { centre, axes: to.axes };
+            let centre = self.centre.lerp(to.centre, share(part));
+            let between = Body { centre, axes: to.axes, half_m: PAD_HALF_M };
             let [one, other] = Self { centre, ..*to }.each();
-            [one, between, other].iter().any(|pad| pad.overlaps(block))
+            [one, between, other].iter().any(|body| body.overlaps(block))
         })
     }
 
     /// Each of the two pads.
-    fn each(&self) -> [Pad; 2] {
+    fn each(&self) -> [Body; 2] {
         [1.0, -1.0].map(|side| {
             let offset = self.axes.x_axis * (side * (self.opening_m + PAD_HALF_M.x));
-            Pad { centre: self.centre + offset, axes: self.axes }
+            Body { centre: self.centre + offset, axes: self.axes, half_m: PAD_HALF_M }
         })
     }
 }
 
-/// One pad, world frame, metres.
-struct Pad {
+/// A pad or a held block, world frame, metres.
+struct Body {
     centre: DVec3,
     axes: DMat3,
+    /// Half the edges, along the axes.
+    half_m: DVec3,
 }
 
-impl Pad {
+impl Body {
+    /// `block`, displaced by `by`.
+    fn at(block: &ObservedBlock, by: DVec3) -> Self {
+        let axes = DMat3::from_rotation_z(block.yaw_rad);
+        Self { centre: block.at + by, axes, half_m: block.half_m }
+    }
+
     /// The height of the lowest corner.
     fn lowest_m(&self) -> f64 {
         self.centre.z - self.half_width_m(DVec3::Z)
@@ -138,10 +172,10 @@ impl Pad {
 
     /// Half the width along `axis`.
     fn half_width_m(&self, axis: DVec3) -> f64 {
-        PAD_HALF_M.dot((self.axes.transpose() * axis).abs())
+        self.half_m.dot((self.axes.transpose() * axis).abs())
     }
 
-    /// Returns whether the pad is above `block` or too near to it, seen from above.
+    /// Returns whether the body is above `block` or too near to it, seen from above.
     fn overlaps(&self, block: &ObservedBlock) -> bool {
         let cube =
             Rectangle { along: direction(block.yaw_rad), half: block.half_m.truncate() + BESIDE_M };
@@ -151,6 +185,18 @@ impl Pad {
             apart.dot(axis).abs() < self.half_width_m(axis.extend(0.0)) + cube.half_width_m(axis)
         })
     }
+
+    /// Returns whether the body overlaps `block` on the way to `to`.
+    fn crosses(&self, to: &Self, block: &ObservedBlock) -> bool {
+        (0..=N_PARTS).any(|part| {
+            Self { centre: self.centre.lerp(to.centre, share(part)), ..*to }.overlaps(block)
+        })
+    }
+}
+
+/// The share of a step after `part` of its [`N_PARTS`].
+fn share(part: u32) -> f64 {
+    f64::from(part) / f64::from(N_PARTS)
 }
 
 /// A rectangle on the table, metres.
@@ -186,7 +232,7 @@ mod tests {
     /// Pads of an upright hand that close along y.
     fn pads(centre: DVec3, opening_m: f64) -> Pads {
         let axes = DMat3::from_cols(DVec3::Y, DVec3::X, DVec3::NEG_Z);
-        Pads { centre, axes, opening_m }
+        Pads { centre, axes, opening_m, commanded_m: opening_m }
     }
 
     #[test]
@@ -194,12 +240,15 @@ mod tests {
         let (from, to) = (DVec3::new(0.07, 0.0, 0.12), DVec3::new(0.1, 0.0, 0.03));
         let path =
             |opening_m, block| avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block]);
-        assert_eq!(path(0.05, BLOCK), [DVec3::new(0.1, 0.0, 0.12), to]);
-        let [_, end] = path(0.0, BLOCK);
+        let open = path(0.05, BLOCK);
+        assert_eq!(open, Way { points: [from, DVec3::new(0.1, 0.0, 0.12), to], is_held_up: false });
+        let closed = path(0.0, BLOCK);
+        let end = closed.points[2];
         assert!((end.z - (0.056 + PAD_HALF_M.z + ABOVE_M)).abs() < 1e-12, "{end}");
+        assert!(closed.is_held_up);
         let turned = ObservedBlock { yaw_rad: std::f64::consts::FRAC_PI_4, ..BLOCK };
-        assert_eq!(path(0.033, BLOCK)[1], to);
-        assert!(path(0.033, turned)[1].z > 0.07, "a corner is under a pad");
+        assert_eq!(path(0.033, BLOCK).points[2], to);
+        assert!(path(0.033, turned).points[2].z > 0.07, "a corner is under a pad");
     }
 
     #[test]
@@ -211,7 +260,7 @@ mod tests {
         };
         let beside = DVec3::new(0.1, -0.06, 0.12);
         let (from, to) = (tilted(beside), tilted(beside.with_z(0.03)));
-        let [_, end] = avoid_blocks(&from, &to, &[BLOCK]);
+        let [.., end] = avoid_blocks(&from, &to, &[BLOCK]).points;
         let lower = tilted(end).each().map(|pad| pad.lowest_m());
         assert!(lower[0] < lower[1] - 0.03, "{lower:?}");
         assert!((lower[0] - (0.056 + ABOVE_M)).abs() < 1e-12, "{lower:?}");
@@ -221,10 +270,41 @@ mod tests {
     fn pads_that_would_graze_a_block_cross_it_higher() {
         let grazing = 0.056 + PAD_HALF_M.z - 0.001;
         let from = DVec3::new(0.04, 0.0, grazing);
-        let [corner, end] =
-            avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.16, 0.0, 0.03), 0.0), &[BLOCK]);
-        assert!((corner.z - (grazing + 0.005)).abs() < 1e-12, "{corner}");
-        assert_eq!(end, DVec3::new(0.16, 0.0, 0.03));
+        let to = DVec3::new(0.16, 0.0, 0.03);
+        let [raised, corner, end] = avoid_blocks(&pads(from, 0.0), &pads(to, 0.0), &[BLOCK]).points;
+        assert!((raised - from.with_z(grazing + 0.005)).length() < 1e-12, "{raised}");
+        assert_eq!([corner, end], [to.with_z(raised.z), to]);
+    }
+
+    #[test]
+    fn a_pad_that_starts_below_the_top_does_not_land_on_a_block_either() {
+        // One pad is above the block, the other one beside it and a little lower than its top.
+        let from = DVec3::new(0.1, -0.06, 0.056 + PAD_HALF_M.z);
+        let tilted = |centre| {
+            let open = pads(centre, 0.03);
+            Pads { axes: DMat3::from_rotation_x(0.2) * open.axes, ..open }
+        };
+        let (from, to) = (tilted(from), tilted(DVec3::new(0.1, 0.03, 0.05)));
+        let is_above = from.each().map(|pad| pad.is_above(&BLOCK));
+        assert_eq!(is_above, [true, false]);
+        let way = avoid_blocks(&from, &to, &[BLOCK]);
+        let lowest_m = tilted(way.points[2]).each().map(|pad| pad.lowest_m());
+        assert!(lowest_m[1] >= 0.056 + ABOVE_M - 1e-12, "{lowest_m:?}");
+        assert!(way.is_held_up);
+    }
+
+    #[test]
+    fn a_held_block_passes_over_another_one() {
+        let from = DVec3::new(0.1, 0.07, 0.09);
+        let held = ObservedBlock { at: from, ..BLOCK };
+        let holding = |centre| Pads { commanded_m: 0.0, ..pads(centre, 0.028) };
+        let to = DVec3::new(0.1, 0.0, 0.05);
+        let way = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
+        let lowest_m = way.points[2].z - 0.028;
+        assert!((lowest_m - (0.056 + ABOVE_M)).abs() < 1e-12, "{lowest_m}");
+        assert!(way.is_held_up);
+        let alone = avoid_blocks(&holding(from), &holding(to), &[held]);
+        assert_eq!(alone.points[2], to);
     }
 
     #[test]
@@ -235,7 +315,11 @@ mod tests {
         let path = |blocks: &[ObservedBlock]| {
             avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.08, 0.0, 0.03), 0.0), blocks)
         };
-        assert_eq!(path(&[high, far])[0], from.with_z(0.03), "beside one block, above another");
+        assert_eq!(
+            path(&[high, far]).points[1],
+            from.with_z(0.03),
+            "beside one block, above another"
+        );
     }
 
     #[test]
@@ -245,19 +329,19 @@ mod tests {
         let path = |opening_m, to, block| {
             avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block])
         };
-        let [_, end] = path(0.02, from.with_z(0.03), held);
+        let [.., end] = path(0.02, from.with_z(0.03), held).points;
         assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_M))).abs() < 1e-12, "{end}");
-        let [_, end] = path(0.05, from.with_z(0.04), BLOCK);
+        let [.., end] = path(0.05, from.with_z(0.04), BLOCK).points;
         assert!((end.z - 0.04).abs() < 1e-12, "nothing is held by an open gripper");
     }
 
     #[test]
     fn a_hand_beside_a_block_moves_down_before_it_pushes() {
         let from = DVec3::new(0.04, 0.0, 0.04);
-        let path = |to| avoid_blocks(&pads(from, 0.05), &pads(to, 0.05), &[BLOCK]);
+        let path = |to| avoid_blocks(&pads(from, 0.05), &pads(to, 0.05), &[BLOCK]).points;
         let to = DVec3::new(0.08, 0.0, 0.03);
-        assert_eq!(path(to), [from.with_z(0.03), to]);
+        assert_eq!(path(to), [from, from.with_z(0.03), to]);
         let up = from.with_z(0.1);
-        assert_eq!(path(up), [from.midpoint(up), up]);
+        assert_eq!(path(up), [from, from.midpoint(up), up]);
     }
 }

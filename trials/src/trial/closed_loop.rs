@@ -8,9 +8,10 @@ use tandem_kinematics::{
     ArmWaypoint, CheckSettings, ForwardKinematics, Joints, PlacedArm, ReachError, Waypoint,
 };
 
+use self::progress::Progress;
 use crate::simulated::{MAX_OPENING_M, ObjectPose, SharedObject};
 use crate::trial::ActionSource;
-use crate::trial::block_avoidance::{ObservedBlock, Pads, avoid_blocks, lowered};
+use crate::trial::block_avoidance::{ObservedBlock, Pads, Way, avoid_blocks, lowered};
 use crate::trial::mapping::ArmObservation;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
@@ -19,7 +20,9 @@ use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 mod episodes;
+mod nudging;
 mod order;
+mod progress;
 mod sparing;
 mod squeezing;
 mod yielding;
@@ -92,6 +95,9 @@ struct LoopState {
     n_in_success: usize,
     /// Whether an arm holds an object that all arms share.
     carries: bool,
+    progress: Progress,
+    /// Whether each gripper is open no wider than its object needs, because another one lies beside it.
+    narrow: Vec<bool>,
     /// By how much each hand is to withdraw from what it presses on, own frames, metres.
     withdraw: Option<Vec<DVec3>>,
     /// The arms that stay out of the other arm's way: their objects are at their goals, or they wait for their turn.
@@ -128,15 +134,19 @@ impl TrialRunner {
                 self.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
             })
             .collect();
-        let before = state.before.replace(now.clone()).unwrap_or_else(|| now.clone());
+        let seen = self.held_as_in_training(&now, state);
+        let before = state.before.replace(seen.clone()).unwrap_or_else(|| seen.clone());
         let mut observation = vec![0.0; layout.n_observation()];
         let mut goal = vec![0.0; layout.n_goal()];
         for arm in layout.arms() {
             let numbers = &mut observation[layout.observation_of(arm)];
-            self.mapping.write_observation(&now[arm.0], &before[arm.0], numbers);
+            self.mapping.write_observation(&seen[arm.0], &before[arm.0], numbers);
             goal[layout.goal_of(arm)].copy_from_slice(&start.goals[arm.0].as_vec3().to_array());
         }
         let meets = layout.arms().all(|arm| self.task.arm_meets_conditions(arm, &observation));
+        let at: Vec<DVec3> = now.iter().map(|now| now.object).collect();
+        let misplaced: Vec<bool> = self.misplaced(&objects, start).collect();
+        state.progress.see(&at, &misplaced);
         state.count_done(&now, &start.goals, self.tolerance_m(), meets);
         state.carries = self.task.shares_object()
             && layout.arms().any(|arm| self.task.arm_holds(arm, &observation));
@@ -221,7 +231,7 @@ impl TrialRunner {
             let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
             if self.attempt(rig, state, wanted, &to, check)? {
-                return Ok(attempt == 0);
+                return Ok(attempt == 0 && !state.progress.is_held_up());
             }
         }
         if !state.carries {
@@ -244,14 +254,17 @@ impl TrialRunner {
         check: &CheckSettings,
     ) -> Result<bool, FailureCause> {
         let first = self.tools(state);
-        let Ok([corner, end, last]) = self.step_waypoints(to, state, wanted) else {
+        let measured = rig.encoders().into_iter().map(|(_, opening)| opening);
+        let Ok((step, held_up)) = self.step_waypoints(to, state, wanted, measured) else {
             return Ok(false);
         };
-        if is_still(&first, &corner) && is_still(&first, &last) {
+        state.progress.hold_up(held_up);
+        if step.iter().all(|waypoint| is_still(&first, waypoint)) {
             state.openings_m.clone_from(&wanted.openings_m);
             return Ok(true);
         }
-        let waypoints = [first.clone(), corner, end, last];
+        let [rise, corner, end, last] = step;
+        let waypoints = [first.clone(), rise, corner, end, last];
         let Ok(motion) = self.motion(&waypoints, &state.at, check) else { return Ok(false) };
         let ends: Vec<Joints> =
             motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
@@ -334,18 +347,22 @@ impl TrialRunner {
         }
     }
 
-    /// Returns the waypoints of the tools for end effectors that move `to` (own frames, metres): a corner, the end, and the
-    /// end again with closed grippers. A gripper that closed while it moves would drag its object along.
+    /// Returns the waypoints of the tools for end effectors that move `to` (own frames, metres): two corners, the end, and
+    /// the end again with closed grippers. A gripper that closed while it moves would drag its object along. `measured`
+    /// are the openings of the grippers, 0 to 1. Also returns whether a block keeps each hand from where it is to be.
     fn step_waypoints(
         &self,
         to: &[DVec3],
         state: &LoopState,
         wanted: &WantedStep<'_>,
-    ) -> Result<[Waypoint; 3], FailureCause> {
+        measured: impl Iterator<Item = f64>,
+    ) -> Result<([Waypoint; 4], Vec<bool>), FailureCause> {
         let WantedStep { openings_m, blocks, .. } = wanted;
         let from = self.hands(state);
-        let mut step: [Waypoint; 3] = Default::default();
-        for (arm, placed) in self.mapping.cell().arms.iter().enumerate() {
+        let mut step: [Waypoint; 4] = Default::default();
+        let mut held_up = Vec::new();
+        let arms = self.mapping.cell().arms.iter().zip(measured).enumerate();
+        for (arm, (placed, measured)) in arms {
             let (idx, near) = (ArmIndex(arm), &state.at[arm]);
             let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
@@ -358,22 +375,26 @@ impl TrialRunner {
             let pads = |centre, angles| Pads {
                 centre,
                 axes: tool_axes(placed, angles),
-                opening_m: before * f64::from(MAX_OPENING_M),
+                opening_m: before.max(opening).max(measured) * f64::from(MAX_OPENING_M),
+                commanded_m: before * f64::from(MAX_OPENING_M),
             };
             let pads_before = pads(from, near);
-            let [corner, end] = if state.carries {
+            let way = if state.carries {
                 let end = lowered(&pads_before, to, blocks);
-                [from.midpoint(end), end]
+                Way { points: [from, from.midpoint(end), end], is_held_up: false }
             } else {
                 avoid_blocks(&pads_before, &pads(to, &then), blocks)
             };
+            held_up.push(way.is_held_up);
             let openings = if opening < before {
-                [before, before, opening]
+                [before, before, before, opening]
             } else {
-                [0.5 * (before + opening), opening, opening]
+                [before, 0.5 * (before + opening), opening, opening]
             };
-            let points = [corner, end, end];
-            for ((waypoint, point), opening) in step.iter_mut().zip(points).zip(openings) {
+            let [rise, corner, end] = way.points;
+            for ((waypoint, point), opening) in
+                step.iter_mut().zip([rise, corner, end, end]).zip(openings)
+            {
                 let (tool_in_world_m, _) = tool(point)?;
                 waypoint.push(ArmWaypoint {
                     tool_in_world_m: tool_in_world_m.into(),
@@ -381,7 +402,7 @@ impl TrialRunner {
                 });
             }
         }
-        Ok(step)
+        Ok((step, held_up))
     }
 }
 
@@ -396,6 +417,8 @@ impl LoopState {
             n_done: 0,
             n_in_success: 0,
             carries: false,
+            progress: Progress::new(at.len()),
+            narrow: vec![false; at.len()],
             withdraw: None,
             parked: vec![false; at.len()],
             n_waits: 0,
@@ -405,7 +428,7 @@ impl LoopState {
     }
 
     /// Appends a step's waypoints. The first one is the previous position of the tools.
-    fn append_waypoints(&mut self, step: [Waypoint; 4]) {
+    fn append_waypoints(&mut self, step: [Waypoint; 5]) {
         let n_known = usize::from(!self.waypoints.is_empty());
         self.waypoints.extend(step.into_iter().skip(n_known));
     }

@@ -106,9 +106,12 @@ impl TrialRunner {
             if self.task.shares_object() {
                 continue;
             }
-            let is_blocked = n_blocked == MAX_BLOCKED;
+            self.nudge(rig, state)?;
+            let is_idle = self.config.layout.task.grasps() && state.progress.is_idle();
+            let is_blocked = n_blocked == MAX_BLOCKED || is_idle;
             if is_blocked {
                 n_blocked = 0;
+                state.progress.start_again();
             }
             if is_blocked || state.parked.contains(&true) {
                 let objects = rig.observe_objects()?;
@@ -150,7 +153,10 @@ impl TrialRunner {
         }
         match self.goal_distances_m(objects, start)[..] {
             [one_m, other_m] if !state.parked.contains(&true) => {
-                let waiting = (usize::from(other_m > one_m) + state.n_waits) % 2;
+                let farther = usize::from(other_m > one_m);
+                // An object at its goal may be held above the table. Its arm waits.
+                let first = if misplaced[farther] && !misplaced[1 - farther] { 1 } else { 0 };
+                let waiting = (farther + first + state.n_waits) % 2;
                 state.n_waits += 1;
                 Turn::Parks(vec![waiting == 0, waiting == 1])
             }
@@ -176,26 +182,31 @@ impl TrialRunner {
 
     /// Returns the arms that are not parked and whose objects are not `misplaced` and lie on the table.
     fn parking(&self, objects: &[ObjectPose], misplaced: &[bool], state: &LoopState) -> Vec<bool> {
-        let lies = |(arm, object): (usize, &ObjectPose)| {
-            let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
-            height_m - self.config.trained_half_m < LYING_M
-        };
-        let lying = objects.iter().enumerate().map(lies);
-        let parks = misplaced.iter().zip(lying).zip(&state.parked);
+        let parks = misplaced.iter().zip(self.lying(objects)).zip(&state.parked);
         parks.map(|((misplaced, lies), parked)| !misplaced && lies && !parked).collect()
     }
 
-    /// Opens the grippers of the `retreating` arms, raises their hands and withdraws them toward their bases, as far as
-    /// the check allows.
+    /// Returns for each arm whether its object lies on the table.
+    fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
+        objects.iter().enumerate().map(|(arm, object)| {
+            let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
+            height_m - self.config.trained_half_m < LYING_M
+        })
+    }
+
+    /// Opens the grippers of the `retreating` arms unless they hold an object above the table, raises their hands and
+    /// withdraws them toward their bases, as far as the check allows.
     pub(super) fn retreat(
         &self,
         rig: &mut TrialRig<'_>,
         state: &mut LoopState,
         retreating: &[bool],
     ) -> Result<(), FailureCause> {
-        let blocks = self.observed_blocks(&rig.observe_objects()?, None);
+        let objects = rig.observe_objects()?;
+        let blocks = self.observed_blocks(&objects, None);
         let grasps = self.config.layout.task.grasps();
         let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
+        let lifted: Vec<bool> = self.lying(&objects).map(|lies| !lies).collect();
         let raised = |hand: DVec3| self.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
         let withdrawn = |hand: DVec3| self.mapping.withdrawn_hand(hand);
         let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
@@ -204,7 +215,9 @@ impl TrialRunner {
             let mut openings_m = state.openings_m.clone();
             for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
                 hands[arm] = way(hands[arm]);
-                openings_m[arm] = open_m;
+                if !lifted[arm] {
+                    openings_m[arm] = open_m;
+                }
             }
             let wanted = WantedStep { hands, openings_m, blocks: &blocks };
             self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;

@@ -3,7 +3,8 @@
 //! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
 //! end on the edge of their object, and a hand that misses its object pushes it ahead.
 
-use glam::DVec3;
+use glam::{DVec3, EulerRot};
+use tandem_core::ArmIndex;
 
 use super::{LoopState, WantedStep};
 use crate::trial::mapping::ArmObservation;
@@ -15,6 +16,20 @@ const BESIDE_M: f64 = 0.015;
 const NEAR_M: f64 = 0.08;
 /// An object within this horizontal distance of a hand is between its pads, metres.
 const BETWEEN_M: f64 = 0.012;
+/// A hand that has been held up for this many steps is open no wider than its object needs.
+const N_WIDE: usize = 2;
+/// A gripper that is further open than commanded by this much holds something, metres on each side.
+const HOLDS_M: f64 = 0.003;
+/// The centre of a held object is within this horizontal distance of the hand, metres.
+const HELD_M: f64 = 0.02;
+/// A gripper that is open wider than an object by this much does not hold it, metres on each side.
+const OPEN_M: f64 = 0.002;
+/// What a narrow gripper keeps between its pads and an object, metres on each side.
+const CLEARANCE_M: f64 = 0.005;
+/// A hand grasps an object if it ends at most this far above the object's centre, and its pads less than this beside,
+/// metres.
+const GRASP_M: f64 = 0.07;
+const OFF_CENTRE_M: f64 = 0.035;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
 const AHEAD_M: f64 = 0.045;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
@@ -24,7 +39,7 @@ const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
     /// Replaces what the policy wants: a gripper that descends to its object closes no further until its pads are beside
-    /// the object, and a hand that would push its object out of reach rises.
+    /// the object, and a hand that would push an object out of its arm's reach rises.
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
@@ -34,16 +49,71 @@ impl TrialRunner {
         if !self.config.layout.task.grasps() || self.task.shares_object() {
             return;
         }
-        for (arm, now) in now.iter().enumerate() {
+        let seen = now;
+        for (arm, now) in seen.iter().enumerate() {
             let (to, opening_m) = (&mut wanted.hands[arm], &mut wanted.openings_m[arm]);
             if descends_to_object(now, *to) {
                 *opening_m = opening_m.max(state.openings_m[arm]);
             }
-            if self.pushes_out_of_reach(now, *to) {
+            if self.stays_narrow(arm, state, now) {
+                *opening_m = opening_m.min(self.narrow_opening_m(now));
+            }
+            if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
+                (to.x, to.y) = (now.object.x, now.object.y);
+            }
+            let moves_away =
+                |other| other != arm && self.pushes_from_its_arm([arm, other], seen, *to);
+            if self.pushes_out_of_reach(now, *to) || (0..seen.len()).any(moves_away) {
                 *to = self.mapping.reachable_hand(now.hand + DVec3::Z * RISE_M);
                 state.velocities[arm] = DVec3::ZERO;
             }
         }
+    }
+
+    /// Decides whether the gripper of `arm` is open no wider than its object needs: once another object holds it up, until
+    /// it is far from its own.
+    fn stays_narrow(&self, arm: usize, state: &mut LoopState, now: &ArmObservation) -> bool {
+        let apart_m = (now.object - now.hand).truncate().length();
+        if state.progress.n_held_up(arm) >= N_WIDE && apart_m < OFF_CENTRE_M {
+            state.narrow[arm] = true;
+        } else if apart_m > 2.0 * OFF_CENTRE_M {
+            state.narrow[arm] = false;
+        }
+        state.narrow[arm]
+    }
+
+    /// The opening between which the object fits as it is rotated, metres on each side.
+    fn narrow_opening_m(&self, now: &ArmObservation) -> f64 {
+        let (sin, cos) = libm::sincos(now.turn.to_euler(EulerRot::ZYX).0);
+        (sin.abs() + cos.abs()) * self.config.trained_half_m + CLEARANCE_M
+    }
+
+    /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it moves
+    /// `to` (own frame, metres) with an opening of `opening_m`.
+    fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
+        now.opening_m > self.config.trained_half_m + OPEN_M
+            && !holds(commanded_m, now)
+            && (to.z < now.hand.z || opening_m < commanded_m)
+            && to.z < now.object.z + GRASP_M
+            && (now.object - to).truncate().length() < OFF_CENTRE_M
+    }
+
+    /// Returns what the arms observe, with the opening that a gripper has in the training world if it holds an object.
+    pub(super) fn held_as_in_training(
+        &self,
+        now: &[ArmObservation],
+        state: &LoopState,
+    ) -> Vec<ArmObservation> {
+        let mut seen = now.to_vec();
+        if self.config.layout.task.grasps() && !self.task.shares_object() {
+            for (seen, commanded_m) in seen.iter_mut().zip(&state.openings_m) {
+                let is_near = (seen.object - seen.hand).truncate().length() < HELD_M;
+                if is_near && holds(*commanded_m, seen) {
+                    seen.opening_m = seen.opening_m.min(self.config.trained_half_m);
+                }
+            }
+        }
+        seen
     }
 
     /// Returns whether a hand that moves `to` (own frame, metres) would push its object to where no hand can follow.
@@ -58,12 +128,54 @@ impl TrialRunner {
             return false;
         }
         let ahead = (to_object.normalize() * AHEAD_M).extend(0.0);
-        let beyond_m = |hand: DVec3| {
-            let pushed = hand + ahead;
-            (pushed - self.mapping.reachable_hand(pushed)).truncate().length()
-        };
-        beyond_m(to) > beyond_m(now.hand) + BEYOND_M
+        let beyond =
+            |hand: DVec3| beyond_m(hand + ahead, self.mapping.reachable_hand(hand + ahead));
+        beyond(to) > beyond(now.hand) + BEYOND_M
     }
+
+    /// Returns whether the hand of the first arm, or what it holds, would push the object of the other arm to where that
+    /// arm's hand cannot follow if it moves `to`, own frame of the first arm, metres.
+    fn pushes_from_its_arm(
+        &self,
+        [arm, other]: [usize; 2],
+        seen: &[ArmObservation],
+        to: DVec3,
+    ) -> bool {
+        let now = &seen[arm];
+        let others = seen[other].object;
+        let object = self.mapping.object_in_world(ArmIndex(other), others);
+        let object = self.mapping.object_in_own(ArmIndex(arm), object);
+        let is_at_hand = (now.object - now.hand).length() < HELD_M;
+        let half_m = self.config.trained_half_m;
+        let ahead_m = if is_at_hand { 2.0 * half_m } else { AHEAD_M };
+        let lowest_m = now.hand.z.min(to.z) - if is_at_hand { half_m } else { 0.0 };
+        let to_object = (object - now.hand).truncate();
+        let way = (to - now.hand).truncate();
+        let aside_m = way.normalize_or_zero().perp_dot(to_object).abs();
+        let gap_m = to_object.length() - ahead_m;
+        if lowest_m >= object.z + half_m
+            || way.dot(to_object) <= 0.0
+            || aside_m > ahead_m
+            || gap_m > way.length()
+        {
+            return false;
+        }
+        let moved = (way - way.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
+        let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
+        let then = self.mapping.object_in_own(ArmIndex(other), then);
+        let beyond = |at: DVec3| beyond_m(at, self.mapping.reachable_hand(at));
+        beyond(then) > beyond(others) + BEYOND_M
+    }
+}
+
+/// Returns by how far `at` is beyond what hands reach according to `reachable`, horizontally, metres.
+fn beyond_m(at: DVec3, reachable: DVec3) -> f64 {
+    (at - reachable).truncate().length()
+}
+
+/// Returns whether a gripper commanded to `commanded_m` (metres on each side) holds something.
+fn holds(commanded_m: f64, now: &ArmObservation) -> bool {
+    commanded_m < now.opening_m - HOLDS_M
 }
 
 /// Returns whether a hand that moves `to` (own frame, metres) descends to its object and ends with its pads higher than
@@ -110,6 +222,97 @@ mod tests {
     }
 
     #[test]
+    fn a_hand_that_descends_off_centre_to_its_object_ends_above_its_centre() {
+        let object = DVec3::new(0.1, 0.0, 0.028);
+        let off = DVec3::new(0.02, -0.02, 0.0);
+        let high = object.with_z(0.1) + off;
+        let step = |task, now, to| spared(task, now, to).0;
+        let pick = Task::SharedPickAndPlace;
+        assert_eq!(step(pick, seen(high, object), high.with_z(0.06)), object.with_z(0.06));
+        assert_eq!(step(Task::SharedPush, seen(high, object), high.with_z(0.06)).x, high.x);
+        let far = DVec3::X * 0.05;
+        let elsewhere = (high + far).with_z(0.06);
+        assert_eq!(step(pick, seen(high + far, object), elsewhere), elsewhere);
+        let holding = ArmObservation { opening_m: 0.054, ..seen(object + off, object) };
+        let dragged = object + 0.5 * off;
+        assert_eq!(step(pick, holding, dragged), dragged, "it holds the object");
+    }
+
+    #[test]
+    fn a_hand_rises_instead_of_pushing_an_object_out_of_its_arms_reach() {
+        let mut runner = runner(Task::SharedPickAndPlace);
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        // As far from the second arm as its hand reaches, seen from the first arm, toward whose base the hand moves.
+        let farthest = runner.mapping.reachable_hand(DVec3::new(1.0, 0.0, 0.03));
+        let in_world = runner.mapping.object_in_world(ArmIndex(1), farthest);
+        let seen_by_first = runner.mapping.object_in_own(ArmIndex(0), in_world);
+        let hand = seen_by_first + DVec3::X * 0.05;
+        let away = DVec3::new(0.1, 0.15, 0.03);
+        let mut moved = |to: DVec3| {
+            let now = [seen(hand, away), seen(DVec3::new(0.0, -0.15, 0.2), farthest)];
+            let mut wanted =
+                WantedStep { hands: vec![to, now[1].hand], openings_m: vec![0.05; 2], blocks: &[] };
+            runner.spare_objects(&mut state, &now, &mut wanted);
+            wanted.hands[0]
+        };
+        let pushing = hand - DVec3::X * 0.04;
+        assert!(moved(pushing).z > hand.z + 0.05, "toward the first arm");
+        let beside = hand + DVec3::Y * 0.04;
+        assert_eq!(moved(beside), beside);
+        let back = hand + DVec3::X * 0.04;
+        assert_eq!(moved(back), back);
+    }
+
+    #[test]
+    fn a_held_object_looks_as_in_the_training_world() {
+        let mut runner = runner(Task::SharedPickAndPlace);
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        let half_m = runner.config.trained_half_m;
+        let object = DVec3::new(0.1, 0.0, 0.03);
+        // Held by two edges, so that the gripper is further open than the object is wide.
+        let held = ArmObservation { opening_m: 1.4 * half_m, ..seen(object, object) };
+        let mut opening_m = |commanded_m: f64, now: ArmObservation| {
+            state.openings_m = vec![commanded_m; 2];
+            runner.held_as_in_training(&[now, now], &state)[1].opening_m
+        };
+        assert_eq!(opening_m(0.0, held), half_m);
+        assert_eq!(opening_m(1.4 * half_m, held), 1.4 * half_m, "it does not press");
+        let away = ArmObservation { hand: object + DVec3::X * 0.05, ..held };
+        assert_eq!(opening_m(0.0, away), 1.4 * half_m, "it presses on something else");
+    }
+
+    #[test]
+    fn a_gripper_that_another_object_holds_up_becomes_narrow() {
+        let mut runner = runner(Task::SharedPickAndPlace);
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        let object = DVec3::new(0.1, 0.0, 0.03);
+        let above = seen(object.with_z(0.1), object);
+        let mut opening_m = |now: ArmObservation| {
+            state.openings_m = vec![0.06; 2];
+            state.progress.hold_up(vec![true, false]);
+            state.progress.see(&[object; 2], &[true; 2]);
+            let mut wanted =
+                WantedStep { hands: vec![now.hand; 2], openings_m: vec![0.06; 2], blocks: &[] };
+            runner.spare_objects(&mut state, &[now, now], &mut wanted);
+            wanted.openings_m
+        };
+        assert_eq!(opening_m(above), [0.06, 0.06], "held up once");
+        let narrow_m = runner.config.trained_half_m + CLEARANCE_M;
+        assert_eq!(opening_m(above), [narrow_m, 0.06]);
+        let yaw = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_4);
+        let wider_m = opening_m(ArmObservation { turn: yaw, ..above })[0];
+        assert!((wider_m - CLEARANCE_M - 2.0_f64.sqrt() * (narrow_m - CLEARANCE_M)).abs() < 1e-9);
+        let away = ArmObservation { hand: above.hand + DVec3::X * 0.1, ..above };
+        assert_eq!(opening_m(away), [0.06, 0.06]);
+    }
+
+    #[test]
     fn a_gripper_closes_once_its_pads_are_beside_the_object() {
         let object = DVec3::new(0.1, 0.0, 0.028);
         let step = |from_m: f64, to_m: f64| {
@@ -140,7 +343,7 @@ mod tests {
         assert_eq!(step(seen(hand + above, object), outward + above), outward + above);
         let shift = DVec3::X * 0.15;
         let central = outward - shift;
-        assert_eq!(step(seen(hand - shift, object - shift), central), central);
+        assert_eq!(step(seen(hand - shift, object - shift), central).z, central.z);
         let (pushed, _) = spared(Task::SharedPush, seen(hand, object), outward);
         assert_eq!(pushed, outward, "a policy that pushes has to push");
     }

@@ -40,7 +40,8 @@ impl TrialRunner {
         });
         state.withdraw = Some(withdraw.collect());
         let reached = self.tools(state);
-        state.append_waypoints([first, reached.clone(), reached.clone(), reached]);
+        let [rise, corner, end] = std::array::from_fn(|_| reached.clone());
+        state.append_waypoints([first, rise, corner, end, reached]);
     }
 
     /// Withdraws the hands that pressed on something in the step before. Returns whether there were any.

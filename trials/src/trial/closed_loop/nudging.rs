@@ -1,0 +1,160 @@
+//! Objects that lie side by side.
+//!
+//! A hand cannot grasp an object if another one lies where a pad has to be. In the training world its pads force their way
+//! down; an arm's are [held up](crate::trial::block_avoidance). Such a hand pushes one of the objects along the other one,
+//! with a closed gripper and across its closing direction, so that there is room for its pads.
+
+use glam::{DQuat, DVec3};
+use tandem_core::ArmIndex;
+
+use super::{LoopState, WantedStep, tool_axes};
+use crate::simulated::ObjectPose;
+use crate::trial::outcome::FailureCause;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::TrialRunner;
+
+/// A hand that has been held up for this many steps in a row pushes its object.
+const N_HELD_UP: usize = 6;
+/// An object at most this far from a hand is below it, horizontally, metres.
+const BELOW_M: f64 = 0.03;
+/// Objects whose centres are at most this far apart may lie side by side, in edges of an object.
+const SIDE_BY_SIDE: f64 = 1.6;
+/// The distance by which an object is pushed, metres.
+const PUSH_M: f64 = 0.045;
+/// Half the width of closed pads, and what is kept between them and the object at first, metres.
+const PADS_M: f64 = 0.008;
+const GAP_M: f64 = 0.004;
+/// Height by which a hand rises before it moves beside its object, metres.
+const RISE_M: f64 = 0.06;
+
+/// A push along the table: the hand's positions before and after it, own frame, metres.
+#[derive(Debug, PartialEq)]
+struct Push {
+    from: DVec3,
+    to: DVec3,
+}
+
+impl TrialRunner {
+    /// Pushes the object of a hand that has been held up for long along the one beside it, or that one along it.
+    pub(super) fn nudge(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+    ) -> Result<(), FailureCause> {
+        if !self.config.layout.task.grasps() || self.task.shares_object() {
+            return Ok(());
+        }
+        let mut arms = 0..state.at.len();
+        let Some(arm) = arms.find(|arm| state.progress.n_held_up(*arm) >= N_HELD_UP) else {
+            return Ok(());
+        };
+        state.progress.release(arm);
+        let objects = rig.observe_objects()?;
+        let Some(Push { from, to }) = self.push(arm, &objects, state) else { return Ok(()) };
+        let blocks = self.observed_blocks(&objects, None);
+        let raised = self.mapping.reachable_hand(self.hands(state)[arm] + DVec3::Z * RISE_M);
+        let open_m = self.mapping.max_opening_m();
+        let ways = [
+            (raised, open_m),
+            (from.with_z(raised.z), 0.0),
+            (from, 0.0),
+            (to, 0.0),
+            (to.with_z(raised.z), open_m),
+        ];
+        for (hand, opening_m) in ways {
+            let mut hands = self.hands(state);
+            let mut openings_m = state.openings_m.clone();
+            (hands[arm], openings_m[arm]) = (hand, opening_m);
+            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
+            if !self.attempt(rig, state, &wanted, &wanted.hands, &self.check)? {
+                break;
+            }
+        }
+        state.velocities.fill(DVec3::ZERO);
+        Ok(())
+    }
+
+    /// Returns the push that makes room for the pads of `arm`: of its own object, rather away from the other one than past
+    /// it, or else of the other one. There is none if no other object lies beside the arm's own, or if hands cannot reach the
+    /// places.
+    fn push(&self, arm: usize, objects: &[ObjectPose], state: &LoopState) -> Option<Push> {
+        let own = |object: &ObjectPose| self.mapping.object_in_own(ArmIndex(arm), object.at_m);
+        let half_m = f64::from(self.config.block.half_m);
+        let object = own(&objects[arm]);
+        let is_below = (object - self.hands(state)[arm]).truncate().length() < BELOW_M;
+        let is_beside = |other: &usize| {
+            let apart_m = (own(&objects[*other]) - object).truncate().length();
+            *other != arm && apart_m < 2.0 * half_m * SIDE_BY_SIDE
+        };
+        let other = (0..objects.len()).find(is_beside).filter(|_| is_below)?;
+        let across = self.across(arm, state);
+        let apart = object - own(&objects[other]);
+        let away = if apart.dot(across) < 0.0 { -across } else { across };
+        let pushes = [(arm, away), (arm, -away), (other, -away), (other, away)];
+        let corner_m = std::f64::consts::SQRT_2 * half_m;
+        pushes.into_iter().find_map(|(pushed, along)| {
+            let beside = object - apart;
+            let (at, rests) = if pushed == arm { (object, beside) } else { (beside, object) };
+            let push = Push {
+                from: at - along * (corner_m + PADS_M + GAP_M),
+                to: at + along * (PUSH_M - half_m - PADS_M),
+            };
+            let has_room = (rests - push.from).truncate().length() > corner_m + PADS_M;
+            let then = self.mapping.object_in_world(ArmIndex(arm), at + along * PUSH_M);
+            let then = self.mapping.object_in_own(ArmIndex(pushed), then);
+            let is_reached = self.is_reached(push.from) && self.is_reached(push.to);
+            (has_room && is_reached && self.is_reached(then)).then_some(push)
+        })
+    }
+
+    /// The horizontal direction across the closing direction of the hand of `arm`, own frame.
+    fn across(&self, arm: usize, state: &LoopState) -> DVec3 {
+        let placed = &self.mapping.cell().arms[arm];
+        let in_world = tool_axes(placed, &state.at[arm]).y_axis;
+        let own = DQuat::from_rotation_z(-placed.yaw_rad) * in_world;
+        own.with_z(0.0).normalize_or(DVec3::X)
+    }
+
+    /// Returns whether hands reach the place above or at `at`, own frame, metres.
+    fn is_reached(&self, at: DVec3) -> bool {
+        (self.mapping.reachable_hand(at) - at).truncate().length() < GAP_M
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::Task;
+
+    use super::*;
+    use crate::trial::{TrialMode, test_config};
+
+    #[test]
+    fn an_object_is_pushed_along_the_one_beside_it() {
+        let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
+        let mut runner = TrialRunner::new(config).unwrap();
+        let start = runner.start(0).unwrap();
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let state = LoopState::new(&start, &at);
+        let hand = runner.hands(&state)[0];
+        let half_m = f64::from(runner.config.block.half_m);
+        let object = hand.with_z(half_m);
+        let push = |other: DVec3, object: DVec3| {
+            let pose = |own| ObjectPose {
+                at_m: runner.mapping.object_in_world(ArmIndex(0), own),
+                turn: DQuat::IDENTITY,
+                time_s: 0.0,
+            };
+            runner.push(0, &[pose(object), pose(other)], &state)
+        };
+        let beside = DVec3::Y * (2.0 * half_m + 0.002);
+        let outward = push(object + beside - DVec3::X * 0.01, object).unwrap();
+        assert!(outward.from.x < object.x - half_m - PADS_M, "{outward:?}");
+        let moved_m = outward.to.x + PADS_M + half_m - object.x;
+        assert!((moved_m - PUSH_M).abs() < 1e-6, "{outward:?}");
+        let inward = push(object + beside + DVec3::X * 0.01, object).unwrap();
+        assert!(inward.from.x > object.x && inward.to.x < inward.from.x, "{inward:?}");
+        assert_eq!(push(object + 2.0 * beside, object), None, "there is room already");
+        let far = object + DVec3::X * 0.05;
+        assert_eq!(push(far + beside, far), None, "the hand is elsewhere");
+    }
+}
