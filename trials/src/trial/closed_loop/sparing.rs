@@ -1,7 +1,7 @@
 //! Changes to the steps of a policy that grasps, which keep objects where a hand can grasp them.
 //!
 //! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
-//! end on the edge of their object, and a hand that misses its object pushes it ahead.
+//! end on the edge of their object, pads that grasp it off its middle lose it, and a hand that misses it pushes it ahead.
 
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
@@ -26,9 +26,9 @@ const HELD_M: f64 = 0.02;
 const OPEN_M: f64 = 0.002;
 /// What a narrow gripper keeps between its pads and an object, metres on each side.
 const CLEARANCE_M: f64 = 0.005;
-/// A hand grasps an object if it ends at most this far above the object's centre, and its pads less than this beside,
-/// metres.
+/// A hand is about to grasp its object if it ends less than this above the object's centre, metres.
 const GRASP_M: f64 = 0.07;
+/// The object is then less than this away, horizontally, metres.
 const OFF_CENTRE_M: f64 = 0.035;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
 const AHEAD_M: f64 = 0.045;
@@ -38,18 +38,18 @@ const BEYOND_M: f64 = 0.001;
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants: a gripper that descends to its object closes no further until its pads are beside
-    /// the object, and a hand that would push an object out of its arm's reach rises.
+    /// Replaces what the policy wants. A gripper that descends to its object closes no further until its pads are beside the
+    /// object, and one that another object has held up opens no wider than its own needs. A hand that is about to grasp
+    /// goes to the middle of its object, and one that would push an object out of the reach of that object's arm rises.
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
-        now: &[ArmObservation],
+        seen: &[ArmObservation],
         wanted: &mut WantedStep<'_>,
     ) {
         if !self.config.layout.task.grasps() || self.task.shares_object() {
             return;
         }
-        let seen = now;
         for (arm, now) in seen.iter().enumerate() {
             let (to, opening_m) = (&mut wanted.hands[arm], &mut wanted.openings_m[arm]);
             if descends_to_object(now, *to) {
