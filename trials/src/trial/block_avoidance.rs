@@ -17,7 +17,7 @@ const ABOVE_M: f64 = 0.004;
 const HELD_WITHIN_M: f64 = 0.025;
 /// The number of parts of a step at whose ends pads are compared with a block.
 const N_PARTS: u32 = 8;
-/// A hand that ends this far above where it wants to be is held up, metres.
+/// A hand is held up if it ends this far above its wanted position, metres.
 const HELD_UP_M: f64 = 0.01;
 /// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
 const SET_DOWN_M: f64 = 0.002;
@@ -52,7 +52,7 @@ pub(crate) struct Pads {
 pub(crate) struct Way {
     /// Two corners and the end of the path of the point between the pads, world frame, metres.
     pub(crate) points: [DVec3; 3],
-    /// Whether a block keeps the hand from where it wants to be.
+    /// Whether a block keeps the hand from reaching its wanted position.
     pub(crate) is_held_up: bool,
 }
 
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn a_pad_that_starts_below_the_top_does_not_land_on_a_block_either() {
-        // One pad is above the block, the other one beside it and a little lower than its top.
+        // One pad is above the block. The other one is beside it, slightly lower than its top.
         let from = DVec3::new(0.1, -0.06, 0.056 + PAD_HALF_M.z);
         let tilted = |centre| {
             let open = pads(centre, 0.03);

@@ -96,7 +96,7 @@ struct LoopState {
     /// Whether an arm holds an object that all arms share.
     carries: bool,
     progress: Progress,
-    /// Whether each gripper is open no wider than its object needs, because another one lies beside it.
+    /// Whether each gripper opens only as wide as its object needs, because another object lies next to it.
     narrow: Vec<bool>,
     /// By how much each hand is to withdraw from what it presses on, own frames, metres.
     withdraw: Option<Vec<DVec3>>,

@@ -133,7 +133,8 @@ impl TrialRunner {
 
     /// Decides which arms make way: those whose objects lie at their goals on the table. If there are none and the arms
     /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
-    /// the other one. Its turn comes when the object of the other one lies at its goal.
+    /// the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its turn
+    /// comes when the object of the other one lies at its goal.
     fn next_turn(
         &self,
         objects: &[ObjectPose],
@@ -154,9 +155,9 @@ impl TrialRunner {
         match self.goal_distances_m(objects, start)[..] {
             [one_m, other_m] if !state.parked.contains(&true) => {
                 let farther = usize::from(other_m > one_m);
-                // An object at its goal may be held above the table. Its arm waits.
-                let first = if misplaced[farther] && !misplaced[1 - farther] { 1 } else { 0 };
-                let waiting = (farther + first + state.n_waits) % 2;
+                // An arm that holds its object at a goal above the table waits for the other one.
+                let is_other_placed = misplaced[farther] && !misplaced[1 - farther];
+                let waiting = (farther + usize::from(is_other_placed) + state.n_waits) % 2;
                 state.n_waits += 1;
                 Turn::Parks(vec![waiting == 0, waiting == 1])
             }
@@ -319,5 +320,24 @@ mod tests {
         );
         assert_eq!(turn(&neither, [false; 2], true), parks([true, false]), "roles alternate");
         assert_eq!(turn(&first, [false; 2], true), parks([true, false]), "placed ones make way");
+    }
+
+    #[test]
+    fn an_arm_with_its_object_at_a_goal_above_the_table_waits_first() {
+        let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
+        let mut runner = TrialRunner::new(config).unwrap();
+        let mut start = runner.start(0).unwrap();
+        start.goals[0].z = 0.15;
+        let at = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &at);
+        let own = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
+        let pose = |arm: usize| {
+            let at_m = runner.mapping.object_in_world(ArmIndex(arm), own[arm]);
+            ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+        };
+        let objects = [0, 1].map(pose);
+        assert_eq!(runner.lying(&objects).next(), Some(false));
+        let turn = runner.next_turn(&objects, &start, &mut state, true);
+        assert_eq!(turn, Turn::Parks(vec![true, false]), "the misplaced one is farther");
     }
 }

@@ -21,8 +21,9 @@ const BELOW_M: f64 = 0.03;
 const SIDE_BY_SIDE: f64 = 1.6;
 /// The distance by which an object is pushed, metres.
 const PUSH_M: f64 = 0.045;
-/// Half the width of closed pads, and what is kept between them and the object at first, metres.
+/// Half the width of closed pads, metres.
 const PADS_M: f64 = 0.008;
+/// The gap between the pads and the object before the push, metres.
 const GAP_M: f64 = 0.004;
 /// Height by which a hand rises before it moves beside its object, metres.
 const RISE_M: f64 = 0.06;
@@ -35,7 +36,8 @@ struct Push {
 }
 
 impl TrialRunner {
-    /// Pushes the object of a hand that has been held up for long along the one beside it, or that one along it.
+    /// If a hand has been held up for [`N_HELD_UP`] steps, pushes its object along the neighbouring one, or the neighbour
+    /// along its object.
     pub(super) fn nudge(
         &self,
         rig: &mut TrialRig<'_>,

@@ -1,4 +1,4 @@
-//! Whether the arms get on: hands that blocks hold up, and objects that nobody moves.
+//! The progress of a trial: which hands are blocked by objects, and how long the objects have not moved.
 
 use glam::DVec3;
 
@@ -7,7 +7,7 @@ const REST_M: f64 = 0.015;
 /// The arms are idle when all misplaced objects have rested for this many steps.
 const MAX_IDLE: usize = 20;
 
-/// What the arms have achieved in the last steps.
+/// How many steps the hands have been held up and the objects have rested.
 pub(super) struct Progress {
     /// Whether a block kept each hand from where it was to be after the last step.
     held_up: Vec<bool>,
@@ -25,7 +25,7 @@ impl Progress {
         Self { held_up, n_held_up, rested: Vec::new(), n_idle: 0 }
     }
 
-    /// Notes which hands are held up after a motion.
+    /// Records which hands a motion left held up.
     pub(super) fn hold_up(&mut self, held_up: Vec<bool>) {
         self.held_up = held_up;
     }
@@ -35,7 +35,8 @@ impl Progress {
         self.held_up.contains(&true)
     }
 
-    /// Starts a step with objects at `objects`, own frames, metres, which are `misplaced` or not.
+    /// Counts a step that starts with the objects at `objects`, own frames, metres. `misplaced` says which of them are away
+    /// from their goals.
     pub(super) fn see(&mut self, objects: &[DVec3], misplaced: &[bool]) {
         for (n_held_up, is_held_up) in self.n_held_up.iter_mut().zip(&self.held_up) {
             *n_held_up = if *is_held_up { *n_held_up + 1 } else { 0 };
@@ -55,17 +56,17 @@ impl Progress {
         self.n_held_up[arm]
     }
 
-    /// Returns whether nobody has moved an object for long.
+    /// Returns whether no misplaced object has moved for [`MAX_IDLE`] steps.
     pub(super) fn is_idle(&self) -> bool {
         self.n_idle >= MAX_IDLE
     }
 
-    /// Forgets how long the objects have rested.
+    /// Resets the count of steps without a displacement.
     pub(super) fn start_again(&mut self) {
         self.n_idle = 0;
     }
 
-    /// Forgets how long the hand of `arm` has been held up.
+    /// Resets the count of steps in which the hand of `arm` was held up.
     pub(super) fn release(&mut self, arm: usize) {
         self.n_held_up[arm] = 0;
         self.held_up[arm] = false;
