@@ -23,6 +23,7 @@ mod episodes;
 mod nudging;
 mod order;
 mod progress;
+mod recalling;
 mod sparing;
 mod squeezing;
 mod yielding;
@@ -168,7 +169,7 @@ impl TrialRunner {
             wanted.hands.push(hand);
             wanted.openings_m.push(opening_m);
         }
-        self.spare_objects(state, &now, &mut wanted);
+        self.spare_objects(state, &now, &start.goals, &mut wanted);
         self.keep_parked(state, &mut wanted);
         self.move_hands(rig, state, &wanted)
     }

@@ -174,6 +174,7 @@ impl TrialRunner {
     ) -> Result<(), FailureCause> {
         let misplaced: Vec<bool> = self.misplaced(&rig.observe_objects()?, start).collect();
         self.retreat(rig, state, &misplaced)?;
+        self.recall(rig, start, state)?;
         state.parked.fill(false);
         state.before = None;
         let seed = self.config.seed;
@@ -188,7 +189,7 @@ impl TrialRunner {
     }
 
     /// Returns for each arm whether its object lies on the table.
-    fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
+    pub(super) fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
         objects.iter().enumerate().map(|(arm, object)| {
             let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
             height_m - self.config.trained_half_m < LYING_M

@@ -9,6 +9,7 @@ use tandem_core::ArmIndex;
 
 use super::{LoopState, WantedStep, tool_axes};
 use crate::simulated::ObjectPose;
+use crate::trial::block_avoidance::ObservedBlock;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rig::TrialRig;
 use crate::trial::runner::TrialRunner;
@@ -22,17 +23,25 @@ const SIDE_BY_SIDE: f64 = 1.6;
 /// The distance by which an object is pushed, metres.
 const PUSH_M: f64 = 0.045;
 /// Half the width of closed pads, metres.
-const PADS_M: f64 = 0.008;
-/// The gap between the pads and the object before the push, metres.
-const GAP_M: f64 = 0.004;
-/// Height by which a hand rises before it moves beside its object, metres.
+pub(super) const PADS_M: f64 = 0.008;
+/// The gap between the pads of an upright hand and the object before the push, metres. A tilted hand uses most of it up.
+pub(super) const GAP_M: f64 = 0.012;
+/// Tolerance of what counts as within reach, metres.
+const REACH_M: f64 = 0.004;
+/// Height by which a hand rises before it moves beside its object, metres, and the height of its pads above the blocks that
+/// suffices.
 const RISE_M: f64 = 0.06;
+const ABOVE_M: f64 = 0.025;
+/// Largest distance of one motion, metres.
+const LONGEST_M: f64 = 0.1;
+/// A hand has arrived within this distance, metres.
+const ARRIVED_M: f64 = 0.015;
 
 /// A push along the table: the hand's positions before and after it, own frame, metres.
 #[derive(Debug, PartialEq)]
-struct Push {
-    from: DVec3,
-    to: DVec3,
+pub(super) struct Push {
+    pub(super) from: DVec3,
+    pub(super) to: DVec3,
 }
 
 impl TrialRunner {
@@ -52,10 +61,29 @@ impl TrialRunner {
         };
         state.progress.release(arm);
         let objects = rig.observe_objects()?;
-        let Some(Push { from, to }) = self.push(arm, &objects, state) else { return Ok(()) };
-        let blocks = self.observed_blocks(&objects, None);
-        let raised = self.mapping.reachable_hand(self.hands(state)[arm] + DVec3::Z * RISE_M);
-        let open_m = self.mapping.max_opening_m();
+        if let Some(push) = self.push(arm, &objects, state) {
+            self.carry_out(rig, state, arm, &objects, &push)?;
+        }
+        Ok(())
+    }
+
+    /// Pushes with the closed gripper of `arm`, which comes from above and rises again. Returns whether the hand got to both
+    /// ends of the push.
+    pub(super) fn carry_out(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+        arm: usize,
+        objects: &[ObjectPose],
+        push: &Push,
+    ) -> Result<bool, FailureCause> {
+        let Push { from, to } = *push;
+        let blocks = self.observed_blocks(objects, None);
+        let above_m = 2.0 * f64::from(self.config.block.half_m) + ABOVE_M;
+        let hand = self.hands(state)[arm];
+        let raised = hand.with_z(above_m.min(hand.z + RISE_M));
+        let grasps = self.config.layout.task.grasps();
+        let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
         let ways = [
             (raised, open_m),
             (from.with_z(raised.z), 0.0),
@@ -63,17 +91,41 @@ impl TrialRunner {
             (to, 0.0),
             (to.with_z(raised.z), open_m),
         ];
+        let mut arrives = true;
         for (hand, opening_m) in ways {
-            let mut hands = self.hands(state);
-            let mut openings_m = state.openings_m.clone();
-            (hands[arm], openings_m[arm]) = (hand, opening_m);
-            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
-            if !self.attempt(rig, state, &wanted, &wanted.hands, &self.check)? {
+            arrives = self.move_hand(rig, state, arm, (hand, opening_m), &blocks)?;
+            if !arrives {
                 break;
             }
         }
         state.velocities.fill(DVec3::ZERO);
-        Ok(())
+        Ok(arrives)
+    }
+
+    /// Moves the hand of `arm` `to` a position (own frame, metres) with an opening (metres on each side), in parts that the
+    /// check of a motion allows. Returns whether the hand is there, rather than above a block or on its way.
+    fn move_hand(
+        &self,
+        rig: &mut TrialRig<'_>,
+        state: &mut LoopState,
+        arm: usize,
+        to: (DVec3, f64),
+        blocks: &[ObservedBlock],
+    ) -> Result<bool, FailureCause> {
+        let (to, opening_m) = to;
+        let from = self.hands(state)[arm];
+        let n_parts = ((to - from).length() / LONGEST_M) as u32 + 1;
+        for part in 1..=n_parts {
+            let mut hands = self.hands(state);
+            let mut openings_m = state.openings_m.clone();
+            hands[arm] = from.lerp(to, f64::from(part) / f64::from(n_parts));
+            openings_m[arm] = opening_m;
+            let wanted = WantedStep { hands, openings_m, blocks };
+            if !self.attempt(rig, state, &wanted, &wanted.hands, &self.check)? {
+                return Ok(false);
+            }
+        }
+        Ok((self.hands(state)[arm] - to).length() < ARRIVED_M)
     }
 
     /// Returns the push that makes room for the pads of `arm`: of its own object, rather away from the other one than past
@@ -118,8 +170,8 @@ impl TrialRunner {
     }
 
     /// Returns whether hands reach the place above or at `at`, own frame, metres.
-    fn is_reached(&self, at: DVec3) -> bool {
-        (self.mapping.reachable_hand(at) - at).truncate().length() < GAP_M
+    pub(super) fn is_reached(&self, at: DVec3) -> bool {
+        (self.mapping.reachable_hand(at) - at).truncate().length() < REACH_M
     }
 }
 

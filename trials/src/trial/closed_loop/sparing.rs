@@ -1,4 +1,4 @@
-//! Changes to the steps of a policy that grasps, which keep objects where a hand can grasp them.
+//! Changes to the steps of a policy which keep objects where a hand can grasp them, or push them back.
 //!
 //! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
 //! end on the edge of their object, pads that grasp it off its middle lose it, and a hand that misses it pushes it ahead.
@@ -38,35 +38,51 @@ const BEYOND_M: f64 = 0.001;
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants. A gripper that descends to its object closes no further until its pads are beside the
-    /// object, and one that another object has held up opens no wider than its own needs. A hand that is about to grasp
-    /// goes to the middle of its object, and one that would push an object out of the reach of that object's arm rises.
+    /// Replaces what the policy wants of hands that would push an object out of the reach of its arm: they rise. Grippers
+    /// that grasp also [close when and where they should](Self::prepare_grasp).
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
         seen: &[ArmObservation],
+        goals: &[DVec3],
         wanted: &mut WantedStep<'_>,
     ) {
-        if !self.config.layout.task.grasps() || self.task.shares_object() {
+        if self.task.shares_object() {
             return;
         }
         for (arm, now) in seen.iter().enumerate() {
-            let (to, opening_m) = (&mut wanted.hands[arm], &mut wanted.openings_m[arm]);
-            if descends_to_object(now, *to) {
-                *opening_m = opening_m.max(state.openings_m[arm]);
+            if self.config.layout.task.grasps() {
+                self.prepare_grasp(arm, state, now, wanted);
             }
-            if self.stays_narrow(arm, state, now) {
-                *opening_m = opening_m.min(self.narrow_opening_m(now));
-            }
-            if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
-                (to.x, to.y) = (now.object.x, now.object.y);
-            }
+            let to = &mut wanted.hands[arm];
             let moves_away =
                 |other| other != arm && self.pushes_from_its_arm([arm, other], seen, *to);
-            if self.pushes_out_of_reach(now, *to) || (0..seen.len()).any(moves_away) {
+            if self.pushes_out_of_reach(now, *to, goals[arm]) || (0..seen.len()).any(moves_away) {
                 *to = self.mapping.reachable_hand(now.hand + DVec3::Z * RISE_M);
                 state.velocities[arm] = DVec3::ZERO;
             }
+        }
+    }
+
+    /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further until
+    /// its pads are beside the object, and one that another object has held up opens no wider than its own needs. A hand
+    /// that is about to grasp goes to the middle of its object.
+    fn prepare_grasp(
+        &self,
+        arm: usize,
+        state: &mut LoopState,
+        now: &ArmObservation,
+        wanted: &mut WantedStep<'_>,
+    ) {
+        let (to, opening_m) = (&mut wanted.hands[arm], &mut wanted.openings_m[arm]);
+        if descends_to_object(now, *to) {
+            *opening_m = opening_m.max(state.openings_m[arm]);
+        }
+        if self.stays_narrow(arm, state, now) {
+            *opening_m = opening_m.min(self.narrow_opening_m(now));
+        }
+        if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
+            (to.x, to.y) = (now.object.x, now.object.y);
         }
     }
 
@@ -116,8 +132,9 @@ impl TrialRunner {
         seen
     }
 
-    /// Returns whether a hand that moves `to` (own frame, metres) would push its object to where no hand can follow.
-    fn pushes_out_of_reach(&self, now: &ArmObservation, to: DVec3) -> bool {
+    /// Returns whether a hand that moves `to` (own frame, metres) would push its object to where no hand can follow. A
+    /// policy that pushes may do so toward the object's `goal`, own frame, metres.
+    fn pushes_out_of_reach(&self, now: &ArmObservation, to: DVec3, goal: DVec3) -> bool {
         let top_m = now.object.z + self.config.trained_half_m;
         let to_object = (now.object - now.hand).truncate();
         let way = (to - now.hand).truncate();
@@ -127,7 +144,11 @@ impl TrialRunner {
         {
             return false;
         }
-        let ahead = (to_object.normalize() * AHEAD_M).extend(0.0);
+        let to_goal = (goal - now.object).truncate();
+        if !self.config.layout.task.grasps() && (to_goal - way).length() < to_goal.length() {
+            return false;
+        }
+        let ahead = (to_object.normalize() * (AHEAD_M + self.behind_m())).extend(0.0);
         let beyond =
             |hand: DVec3| beyond_m(hand + ahead, self.mapping.reachable_hand(hand + ahead));
         beyond(to) > beyond(now.hand) + BEYOND_M
@@ -163,8 +184,15 @@ impl TrialRunner {
         let moved = (way - way.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
         let then = self.mapping.object_in_own(ArmIndex(other), then);
-        let beyond = |at: DVec3| beyond_m(at, self.mapping.reachable_hand(at));
+        let behind = (then - others).normalize_or_zero() * self.behind_m();
+        let beyond = |at: DVec3| beyond_m(at + behind, self.mapping.reachable_hand(at + behind));
         beyond(then) > beyond(others) + BEYOND_M
+    }
+
+    /// Distance behind an object at which a hand has to be to bring the object back, metres: a policy that pushes gets
+    /// behind it, one that grasps goes to it.
+    fn behind_m(&self) -> f64 {
+        if self.config.layout.task.grasps() { 0.0 } else { AHEAD_M }
     }
 }
 
@@ -208,15 +236,19 @@ mod tests {
         TrialRunner::new(test_config(task, TrialMode::ClosedLoop, 1)).unwrap()
     }
 
-    /// What becomes of a step that closes the gripper from 5 to 3 cm on each side.
+    /// What becomes of a step that closes the gripper from 5 to 3 cm on each side, with goals near the bases.
     fn spared(task: Task, now: ArmObservation, to: DVec3) -> (DVec3, f64) {
+        spared_toward(DVec3::ZERO, task, now, to)
+    }
+
+    fn spared_toward(goal: DVec3, task: Task, now: ArmObservation, to: DVec3) -> (DVec3, f64) {
         let mut runner = runner(task);
         let start = runner.start(0).unwrap();
         let at = runner.mapping.cell().ready(0.2).unwrap();
         let mut state = LoopState::new(&start, &at);
         state.openings_m = vec![0.05; 2];
         let mut wanted = WantedStep { hands: vec![to; 2], openings_m: vec![0.03; 2], blocks: &[] };
-        runner.spare_objects(&mut state, &[now, now], &mut wanted);
+        runner.spare_objects(&mut state, &[now, now], &[goal; 2], &mut wanted);
         assert_eq!(wanted.hands[0], wanted.hands[1]);
         (wanted.hands[0], wanted.openings_m[0])
     }
@@ -254,7 +286,7 @@ mod tests {
             let now = [seen(hand, away), seen(DVec3::new(0.0, -0.15, 0.2), farthest)];
             let mut wanted =
                 WantedStep { hands: vec![to, now[1].hand], openings_m: vec![0.05; 2], blocks: &[] };
-            runner.spare_objects(&mut state, &now, &mut wanted);
+            runner.spare_objects(&mut state, &now, &[DVec3::ZERO; 2], &mut wanted);
             wanted.hands[0]
         };
         let pushing = hand - DVec3::X * 0.04;
@@ -299,7 +331,7 @@ mod tests {
             state.progress.see(&[object; 2], &[true; 2]);
             let mut wanted =
                 WantedStep { hands: vec![now.hand; 2], openings_m: vec![0.06; 2], blocks: &[] };
-            runner.spare_objects(&mut state, &[now, now], &mut wanted);
+            runner.spare_objects(&mut state, &[now, now], &[DVec3::ZERO; 2], &mut wanted);
             wanted.openings_m
         };
         assert_eq!(opening_m(above), [0.06, 0.06], "held up once");
@@ -344,7 +376,12 @@ mod tests {
         let shift = DVec3::X * 0.15;
         let central = outward - shift;
         assert_eq!(step(seen(hand - shift, object - shift), central).z, central.z);
-        let (pushed, _) = spared(Task::SharedPush, seen(hand, object), outward);
-        assert_eq!(pushed, outward, "a policy that pushes has to push");
+        // A policy that pushes has to get behind the object, and may push it to its goal.
+        let push =
+            |goal, now| spared_toward(goal, Task::SharedPush, now, now.hand + DVec3::X * 0.04).0;
+        let nearer = |by_m: f64| seen(hand - DVec3::X * by_m, object - DVec3::X * by_m);
+        assert!(push(DVec3::ZERO, nearer(0.02)).z > hand.z + 0.05);
+        assert_eq!(push(DVec3::ZERO, nearer(0.15)).z, hand.z);
+        assert_eq!(push(DVec3::X * 0.3, nearer(0.02)).z, hand.z);
     }
 }

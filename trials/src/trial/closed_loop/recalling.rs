@@ -1,0 +1,151 @@
+//! Objects that lie where the policy's hand cannot get at them.
+//!
+//! The hand of the training world stays within a box. An object that noise, a neighbour or the other arm has pushed to the
+//! edge of that box cannot be pushed back, because the hand does not get behind it. The arms reach farther: before the next
+//! episode, one of them pushes such an object back.
+
+use glam::DVec3;
+use tandem_core::ArmIndex;
+
+use super::LoopState;
+use super::nudging::{GAP_M, PADS_M, Push};
+use crate::simulated::ObjectPose;
+use crate::trial::outcome::FailureCause;
+use crate::trial::rehearsal::TrialStart;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::TrialRunner;
+
+/// A hand that pushes an object stands this far behind its centre, metres.
+const BEHIND_M: f64 = 0.045;
+/// Distance from an object that can be grasped to the edge of the hand's box, metres.
+const EDGE_M: f64 = 0.02;
+/// Unit of the distance by which an object is pushed, metres.
+const UNIT_M: f64 = 0.01;
+
+impl TrialRunner {
+    /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to get at
+    /// them.
+    pub(super) fn recall(
+        &self,
+        rig: &mut TrialRig<'_>,
+        start: &TrialStart,
+        state: &mut LoopState,
+    ) -> Result<(), FailureCause> {
+        for owner in self.config.layout.arms() {
+            let objects = rig.observe_objects()?;
+            let is_misplaced = self.misplaced(&objects, start).nth(owner.0) == Some(true);
+            if !is_misplaced || self.lying(&objects).nth(owner.0) != Some(true) {
+                continue;
+            }
+            for (arm, push) in self.recalls(owner, &objects, start.goals[owner.0]) {
+                let is_pushed = self.carry_out(rig, state, arm, &objects, &push)?;
+                let mut pushing = vec![false; state.at.len()];
+                pushing[arm] = true;
+                self.retreat(rig, state, &pushing)?;
+                if is_pushed {
+                    break;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the pushes that may bring the object of `owner` back, each with the arm that makes it and in its frame, best
+    /// first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the hand of
+    /// `owner` can get at its object.
+    fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
+        let object = self.mapping.object_in_own(owner, objects[owner.0].at_m);
+        let away_m = if self.config.layout.task.grasps() { EDGE_M } else { BEHIND_M };
+        let is_at_hand =
+            |at: DVec3| self.is_reached(at - (goal - at).with_z(0.0).normalize_or_zero() * away_m);
+        if is_at_hand(object) {
+            return Vec::new();
+        }
+        let to_goal = (goal - object).with_z(0.0);
+        let ways = [to_goal, to_goal.with_x(0.0), to_goal.with_y(0.0)];
+        let mut recalls = Vec::new();
+        for way in ways.into_iter().filter(|way| way.length() > UNIT_M) {
+            let along = way.normalize();
+            let n_units = (way.length() / UNIT_M) as u32;
+            let is_back = |n: &u32| is_at_hand(object + along * (f64::from(*n) * UNIT_M));
+            let n_units = (1..n_units).find(is_back).map_or(n_units, |n| n + 1);
+            let half_m = f64::from(self.config.block.half_m);
+            let corner_m = std::f64::consts::SQRT_2 * half_m;
+            let from = object - along * (corner_m + PADS_M + GAP_M);
+            let to = object + along * (f64::from(n_units) * UNIT_M - half_m - PADS_M);
+            recalls.extend((0..objects.len()).map(|arm| {
+                let seen = |own| {
+                    let at = self.mapping.object_in_world(owner, own);
+                    self.mapping.object_in_own(ArmIndex(arm), at)
+                };
+                (arm, Push { from: seen(from), to: seen(to) })
+            }));
+        }
+        let is_reached = |push: &Push| self.is_reached(push.from) && self.is_reached(push.to);
+        recalls.sort_by_key(|(arm, push)| (!is_reached(push), *arm != owner.0));
+        recalls
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DQuat;
+    use tandem_core::Task;
+
+    use super::*;
+    use crate::trial::{TrialMode, test_config};
+
+    fn recalls(task: Task, object: DVec3, goal: DVec3) -> Vec<(usize, Push)> {
+        let runner = TrialRunner::new(test_config(task, TrialMode::ClosedLoop, 1)).unwrap();
+        let pose = |(arm, own)| ObjectPose {
+            at_m: runner.mapping.object_in_world(ArmIndex(arm), own),
+            turn: DQuat::IDENTITY,
+            time_s: 0.0,
+        };
+        let objects = [(0, object), (1, DVec3::new(0.1, 0.1, object.z))].map(pose);
+        runner.recalls(ArmIndex(0), &objects, goal)
+    }
+
+    /// The largest coordinates of the hand's box, own frame, metres.
+    fn farthest() -> DVec3 {
+        let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
+        TrialRunner::new(config).unwrap().mapping.reachable_hand(DVec3::new(0.1, 1.0, 0.03))
+    }
+
+    #[test]
+    fn an_object_that_a_hand_can_push_back_is_left_alone() {
+        let goal = DVec3::new(0.1, 0.0, 0.03);
+        let edge_m = farthest().y;
+        let object = |room_m: f64| DVec3::new(0.1, edge_m - room_m, 0.03);
+        assert!(recalls(Task::SharedPush, object(BEHIND_M + 0.001), goal).is_empty());
+        assert!(!recalls(Task::SharedPush, object(BEHIND_M - 0.01), goal).is_empty());
+        let pick = Task::SharedPickAndPlace;
+        assert!(recalls(pick, object(BEHIND_M - 0.01), goal).is_empty(), "it can be grasped");
+        assert!(!recalls(pick, object(0.0), goal).is_empty());
+    }
+
+    #[test]
+    fn an_object_at_the_edge_is_pushed_toward_its_goal_until_a_hand_gets_behind_it() {
+        let goal = DVec3::new(0.1, 0.0, 0.03);
+        let object = DVec3::new(0.1, farthest().y - 0.02, 0.03);
+        let found = recalls(Task::SharedPush, object, goal);
+        let (arm, Push { from, to }) = &found[0];
+        assert_eq!(*arm, 0);
+        assert!((from.x - 0.1).abs() < 1e-9 && from.y > object.y + 0.04, "{from}");
+        let half_m = 0.0325;
+        let then_m = to.y - half_m - PADS_M;
+        let room_m = farthest().y - then_m;
+        assert!(room_m > BEHIND_M && room_m < BEHIND_M + 0.03, "{then_m}");
+        let goal_at_side = DVec3::new(0.1, object.y, 0.03) + DVec3::X * 0.05;
+        assert!(recalls(Task::SharedPush, object, goal_at_side).is_empty());
+    }
+
+    #[test]
+    fn an_object_that_its_own_arm_cannot_push_back_is_pushed_by_the_other_one() {
+        let goal = DVec3::new(0.1, 0.05, 0.03);
+        let far = DVec3::new(farthest().x.max(0.24) - 0.01, 0.05, 0.03);
+        let recalls = recalls(Task::SharedPush, far, goal);
+        let arms: Vec<usize> = recalls.iter().map(|(arm, _)| *arm).collect();
+        assert!(arms.contains(&0) && arms.contains(&1), "{arms:?}");
+    }
+}
