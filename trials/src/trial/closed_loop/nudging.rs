@@ -32,8 +32,9 @@ const REACH_M: f64 = 0.004;
 /// suffices.
 const RISE_M: f64 = 0.06;
 const ABOVE_M: f64 = 0.025;
-/// Largest distance of one motion, metres.
+/// Largest distance of one motion, metres, and largest number of motions to one position.
 const LONGEST_M: f64 = 0.1;
+const MAX_PARTS: u32 = 20;
 /// A hand has arrived within this distance, metres.
 const ARRIVED_M: f64 = 0.015;
 
@@ -114,11 +115,11 @@ impl TrialRunner {
     ) -> Result<bool, FailureCause> {
         let (to, opening_m) = to;
         let from = self.hands(state)[arm];
-        let n_parts = ((to - from).length() / LONGEST_M) as u32 + 1;
-        for part in 1..=n_parts {
+        let n_parts = ((to - from).length() / LONGEST_M).floor() + 1.0;
+        for part in (1..=MAX_PARTS).map(f64::from).take_while(|part| *part <= n_parts) {
             let mut hands = self.hands(state);
             let mut openings_m = state.openings_m.clone();
-            hands[arm] = from.lerp(to, f64::from(part) / f64::from(n_parts));
+            hands[arm] = from.lerp(to, part / n_parts);
             openings_m[arm] = opening_m;
             let wanted = WantedStep { hands, openings_m, blocks };
             if !self.attempt(rig, state, &wanted, &wanted.hands, &self.check)? {

@@ -19,8 +19,9 @@ use crate::trial::runner::TrialRunner;
 const BEHIND_M: f64 = 0.045;
 /// Distance from an object that can be grasped to the edge of the hand's box, metres.
 const EDGE_M: f64 = 0.02;
-/// Unit of the distance by which an object is pushed, metres.
+/// Unit of the distance by which an object is pushed, metres, and largest number of units.
 const UNIT_M: f64 = 0.01;
+const MAX_UNITS: u32 = 100;
 
 impl TrialRunner {
     /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to get at
@@ -66,13 +67,14 @@ impl TrialRunner {
         let mut recalls = Vec::new();
         for way in ways.into_iter().filter(|way| way.length() > UNIT_M) {
             let along = way.normalize();
-            let n_units = (way.length() / UNIT_M) as u32;
-            let is_back = |n: &u32| is_at_hand(object + along * (f64::from(*n) * UNIT_M));
-            let n_units = (1..n_units).find(is_back).map_or(n_units, |n| n + 1);
+            let n_units = (way.length() / UNIT_M).floor();
+            let is_back = |n: &f64| is_at_hand(object + along * (*n * UNIT_M));
+            let mut units = (1..MAX_UNITS).map(f64::from).take_while(|n| *n < n_units);
+            let n_units = units.find(is_back).map_or(n_units, |n| n + 1.0);
             let half_m = f64::from(self.config.block.half_m);
             let corner_m = std::f64::consts::SQRT_2 * half_m;
             let from = object - along * (corner_m + PADS_M + GAP_M);
-            let to = object + along * (f64::from(n_units) * UNIT_M - half_m - PADS_M);
+            let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
             recalls.extend((0..objects.len()).map(|arm| {
                 let seen = |own| {
                     let at = self.mapping.object_in_world(owner, own);
@@ -106,16 +108,16 @@ mod tests {
         runner.recalls(ArmIndex(0), &objects, goal)
     }
 
-    /// The largest coordinates of the hand's box, own frame, metres.
-    fn farthest() -> DVec3 {
+    /// The position of a hand that is to go far in the direction `to`, own frame, metres.
+    fn farthest(to: DVec3) -> DVec3 {
         let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
-        TrialRunner::new(config).unwrap().mapping.reachable_hand(DVec3::new(0.1, 1.0, 0.03))
+        TrialRunner::new(config).unwrap().mapping.reachable_hand(DVec3::new(0.1, 0.05, 0.03) + to)
     }
 
     #[test]
     fn an_object_that_a_hand_can_push_back_is_left_alone() {
         let goal = DVec3::new(0.1, 0.0, 0.03);
-        let edge_m = farthest().y;
+        let edge_m = farthest(DVec3::Y).y;
         let object = |room_m: f64| DVec3::new(0.1, edge_m - room_m, 0.03);
         assert!(recalls(Task::SharedPush, object(BEHIND_M + 0.001), goal).is_empty());
         assert!(!recalls(Task::SharedPush, object(BEHIND_M - 0.01), goal).is_empty());
@@ -127,14 +129,14 @@ mod tests {
     #[test]
     fn an_object_at_the_edge_is_pushed_toward_its_goal_until_a_hand_gets_behind_it() {
         let goal = DVec3::new(0.1, 0.0, 0.03);
-        let object = DVec3::new(0.1, farthest().y - 0.02, 0.03);
+        let object = DVec3::new(0.1, farthest(DVec3::Y).y - 0.02, 0.03);
         let found = recalls(Task::SharedPush, object, goal);
         let (arm, Push { from, to }) = &found[0];
         assert_eq!(*arm, 0);
         assert!((from.x - 0.1).abs() < 1e-9 && from.y > object.y + 0.04, "{from}");
         let half_m = 0.0325;
         let then_m = to.y - half_m - PADS_M;
-        let room_m = farthest().y - then_m;
+        let room_m = farthest(DVec3::Y).y - then_m;
         assert!(room_m > BEHIND_M && room_m < BEHIND_M + 0.03, "{then_m}");
         let goal_at_side = DVec3::new(0.1, object.y, 0.03) + DVec3::X * 0.05;
         assert!(recalls(Task::SharedPush, object, goal_at_side).is_empty());
@@ -143,9 +145,11 @@ mod tests {
     #[test]
     fn an_object_that_its_own_arm_cannot_push_back_is_pushed_by_the_other_one() {
         let goal = DVec3::new(0.1, 0.05, 0.03);
-        let far = DVec3::new(farthest().x.max(0.24) - 0.01, 0.05, 0.03);
-        let recalls = recalls(Task::SharedPush, far, goal);
-        let arms: Vec<usize> = recalls.iter().map(|(arm, _)| *arm).collect();
-        assert!(arms.contains(&0) && arms.contains(&1), "{arms:?}");
+        let far = DVec3::new(farthest(DVec3::X).x - 0.035, 0.05, 0.03);
+        let found = recalls(Task::SharedPush, far, goal);
+        assert_eq!((found[0].0, found[found.len() - 1].0), (1, 0), "{found:?}");
+        // Toward the goal of the first arm, seen from the other one, which faces it.
+        let Push { from, to } = &found[0].1;
+        assert!(to.x > from.x && (to.y - from.y).abs() < 1e-6, "{from} {to}");
     }
 }
