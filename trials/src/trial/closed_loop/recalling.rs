@@ -9,14 +9,13 @@ use tandem_core::ArmIndex;
 
 use super::LoopState;
 use super::nudging::{GAP_M, PADS_M, Push};
+use super::sparing::AHEAD_M;
 use crate::simulated::ObjectPose;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::TrialRig;
 use crate::trial::runner::TrialRunner;
 
-/// A hand that pushes an object stands this far behind its centre, metres.
-const BEHIND_M: f64 = 0.045;
 /// Distance from an object that can be grasped to the edge of the hand's box, metres.
 const EDGE_M: f64 = 0.02;
 /// Unit of the distance by which an object is pushed, metres, and largest number of units.
@@ -56,7 +55,7 @@ impl TrialRunner {
     /// `owner` can get at its object.
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
         let object = self.mapping.object_in_own(owner, objects[owner.0].at_m);
-        let away_m = if self.config.layout.task.grasps() { EDGE_M } else { BEHIND_M };
+        let away_m = if self.config.layout.task.grasps() { EDGE_M } else { AHEAD_M };
         let is_at_hand =
             |at: DVec3| self.is_reached(at - (goal - at).with_z(0.0).normalize_or_zero() * away_m);
         if is_at_hand(object) {
@@ -64,6 +63,8 @@ impl TrialRunner {
         }
         let to_goal = (goal - object).with_z(0.0);
         let ways = [to_goal, to_goal.with_x(0.0), to_goal.with_y(0.0)];
+        let half_m = f64::from(self.config.block.half_m);
+        let corner_m = std::f64::consts::SQRT_2 * half_m;
         let mut recalls = Vec::new();
         for way in ways.into_iter().filter(|way| way.length() > UNIT_M) {
             let along = way.normalize();
@@ -71,8 +72,6 @@ impl TrialRunner {
             let is_back = |n: &f64| is_at_hand(object + along * (*n * UNIT_M));
             let mut units = (1..MAX_UNITS).map(f64::from).take_while(|n| *n < n_units);
             let n_units = units.find(is_back).map_or(n_units, |n| n + 1.0);
-            let half_m = f64::from(self.config.block.half_m);
-            let corner_m = std::f64::consts::SQRT_2 * half_m;
             let from = object - along * (corner_m + PADS_M + GAP_M);
             let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
             recalls.extend((0..objects.len()).map(|arm| {
@@ -119,10 +118,10 @@ mod tests {
         let goal = DVec3::new(0.1, 0.0, 0.03);
         let edge_m = farthest(DVec3::Y).y;
         let object = |room_m: f64| DVec3::new(0.1, edge_m - room_m, 0.03);
-        assert!(recalls(Task::SharedPush, object(BEHIND_M + 0.001), goal).is_empty());
-        assert!(!recalls(Task::SharedPush, object(BEHIND_M - 0.01), goal).is_empty());
+        assert!(recalls(Task::SharedPush, object(AHEAD_M + 0.001), goal).is_empty());
+        assert!(!recalls(Task::SharedPush, object(AHEAD_M - 0.01), goal).is_empty());
         let pick = Task::SharedPickAndPlace;
-        assert!(recalls(pick, object(BEHIND_M - 0.01), goal).is_empty(), "it can be grasped");
+        assert!(recalls(pick, object(AHEAD_M - 0.01), goal).is_empty(), "it can be grasped");
         assert!(!recalls(pick, object(0.0), goal).is_empty());
     }
 
@@ -137,7 +136,7 @@ mod tests {
         let half_m = 0.0325;
         let then_m = to.y - half_m - PADS_M;
         let room_m = farthest(DVec3::Y).y - then_m;
-        assert!(room_m > BEHIND_M && room_m < BEHIND_M + 0.03, "{then_m}");
+        assert!(room_m > AHEAD_M && room_m < AHEAD_M + 0.03, "{then_m}");
         let goal_at_side = DVec3::new(0.1, object.y, 0.03) + DVec3::X * 0.05;
         assert!(recalls(Task::SharedPush, object, goal_at_side).is_empty());
     }

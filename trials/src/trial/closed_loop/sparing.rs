@@ -1,4 +1,4 @@
-//! Changes to the steps of a policy which keep objects where a hand can grasp them, or push them back.
+//! Changes to the steps of a policy that keep objects where hands can grasp them or push them back.
 //!
 //! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
 //! end on the edge of their object, pads that grasp it off its middle lose it, and a hand that misses it pushes it ahead.
@@ -31,14 +31,14 @@ const GRASP_M: f64 = 0.07;
 /// The object is then less than this away, horizontally, metres.
 const OFF_CENTRE_M: f64 = 0.035;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
-const AHEAD_M: f64 = 0.045;
+pub(super) const AHEAD_M: f64 = 0.045;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
 const BEYOND_M: f64 = 0.001;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of hands that would push an object out of the reach of its arm: they rise. Grippers
+    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm: they rise. Grippers
     /// that grasp also [close when and where they should](Self::prepare_grasp).
     pub(super) fn spare_objects(
         &self,
