@@ -24,7 +24,7 @@ const MAX_UNITS: u32 = 100;
 
 impl TrialRunner {
     /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to get at
-    /// them.
+    /// them. Arms that hold their objects above the table keep them.
     pub(super) fn recall(
         &self,
         rig: &mut TrialRig<'_>,
@@ -34,10 +34,12 @@ impl TrialRunner {
         for owner in self.config.layout.arms() {
             let objects = rig.observe_objects()?;
             let is_misplaced = self.misplaced(&objects, start).nth(owner.0) == Some(true);
-            if !is_misplaced || self.lying(&objects).nth(owner.0) != Some(true) {
+            let is_lying: Vec<bool> = self.lying(&objects).collect();
+            if !is_misplaced || !is_lying[owner.0] {
                 continue;
             }
-            for (arm, push) in self.recalls(owner, &objects, start.goals[owner.0]) {
+            let recalls = self.recalls(owner, &objects, start.goals[owner.0]);
+            for (arm, push) in recalls.into_iter().filter(|(arm, _)| is_lying[*arm]) {
                 let is_pushed = self.carry_out(rig, state, arm, &objects, &push)?;
                 let mut pushing = vec![false; state.at.len()];
                 pushing[arm] = true;
