@@ -1,12 +1,12 @@
 //! Copies of the pair, on which blind motions are rehearsed and tried.
 //!
 //! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. A blind
-//! motion is therefore executed on copies of the pair before one is chosen. The copies have no noise, and none of them has
-//! the friction of the pair.
+//! motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their
+//! noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
 
 use tandem_kinematics::Joints;
 
-use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig};
+use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig, SimulatedPair};
 use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::ObjectResult;
 use crate::trial::rehearsal::TrialStart;
@@ -16,7 +16,10 @@ use crate::trial::runner::TrialRunner;
 use crate::trial::{ActionSource, NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
-pub(super) const FRICTIONS: [f32; 4] = [0.8, 1.2, 0.9, 1.1];
+pub(super) const FRICTIONS: [f32; 8] = [0.8, 1.2, 0.9, 1.1, 0.85, 1.15, 0.95, 1.05];
+/// Added to the number of a trial, this is that of the noise on the first copy; with its multiples, the others follow. No
+/// trial has such a number.
+const FIRST_NOISE: u64 = 1 << 48;
 
 impl TrialRunner {
     /// Executes a planned motion blindly on the copies of the pair. Returns the number of those on which it fails, or
@@ -29,8 +32,11 @@ impl TrialRunner {
         max_failed: usize,
     ) -> Result<Option<usize>, TrialError> {
         let mut n_failed = 0;
-        for friction in FRICTIONS {
-            n_failed += usize::from(!self.succeeds_on_copy(start, at, planned, friction)?);
+        let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * FIRST_NOISE));
+        for (friction, noise) in FRICTIONS.into_iter().zip(noises) {
+            let simulated = with_friction(&self.config.simulated, friction);
+            let pair = self.pair(start, at, noise, &simulated);
+            n_failed += usize::from(!self.succeeds_on(pair, start, planned)?);
             if n_failed > max_failed {
                 return Ok(None);
             }
@@ -38,14 +44,13 @@ impl TrialRunner {
         Ok(Some(n_failed))
     }
 
-    fn succeeds_on_copy(
+    fn succeeds_on(
         &self,
+        pair: SimulatedPair,
         start: &TrialStart,
-        at: &[Joints],
         planned: &PlannedMotion,
-        friction: f32,
     ) -> Result<bool, TrialError> {
-        let report = self.on_copy(start, at, friction, |rig| {
+        let report = self.on(pair, |rig| {
             let initial = rig.pair().objects();
             let execution = self.open_loop(rig, start, planned.clone());
             self.report(start.number, start, &initial, rig, execution)
@@ -55,7 +60,8 @@ impl TrialRunner {
         Ok(report.cause.is_none() && report.objects.iter().all(is_near))
     }
 
-    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction.
+    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction and without
+    /// noise.
     pub(super) fn rehearse_on_copy(
         &self,
         start: &TrialStart,
@@ -63,7 +69,9 @@ impl TrialRunner {
         friction: f32,
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
-        let (execution, ends) = self.on_copy(start, at, friction, |rig| {
+        let simulated = without_noise(&with_friction(&self.config.simulated, friction));
+        let pair = self.pair(start, at, start.number, &simulated);
+        let (execution, ends) = self.on(pair, |rig| {
             let execution = self.closed_loop(rig, start, at, policy);
             (execution, rig.pair().objects())
         })?;
@@ -79,35 +87,38 @@ impl TrialRunner {
         })
     }
 
-    /// Executes `run` on a copy of the pair at the start of the trial.
-    fn on_copy<T>(
+    /// Executes `run` on a copy of the pair.
+    fn on<T>(
         &self,
-        start: &TrialStart,
-        at: &[Joints],
-        friction: f32,
+        pair: SimulatedPair,
         run: impl FnOnce(&mut TrialRig<'_>) -> T,
     ) -> Result<T, TrialError> {
-        let simulated = copy_of(&self.config.simulated, friction);
-        let pair = self.pair(start, at, start.number, &simulated);
         let (cell, mut observer) = (self.mapping.cell().clone(), NoObserver);
         let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer)?;
         Ok(run(&mut rig))
     }
 }
 
-/// Returns the configuration of a copy: the pair without noise and latency, and with `friction` times its friction.
-fn copy_of(simulated: &SimulatedConfig, friction: f32) -> SimulatedConfig {
+/// Returns the configuration of a pair with `friction` times the friction.
+fn with_friction(simulated: &SimulatedConfig, friction: f32) -> SimulatedConfig {
+    SimulatedConfig {
+        gripper: GripperConfig {
+            pad_friction: friction * simulated.gripper.pad_friction,
+            ..simulated.gripper
+        },
+        table_friction: friction * simulated.table_friction,
+        ..simulated.clone()
+    }
+}
+
+/// Returns the configuration of a pair without noise and with the shortest latency.
+fn without_noise(simulated: &SimulatedConfig) -> SimulatedConfig {
     SimulatedConfig {
         latency_periods: [1, 1],
         angle_noise_rad: 0.0,
         rate_noise_radps: 0.0,
         torque_noise_nm: 0.0,
         camera: CameraConfig { place_noise_m: 0.0, turn_noise_rad: 0.0, ..simulated.camera },
-        gripper: GripperConfig {
-            pad_friction: friction * simulated.gripper.pad_friction,
-            ..simulated.gripper
-        },
-        table_friction: friction * simulated.table_friction,
         ..simulated.clone()
     }
 }
