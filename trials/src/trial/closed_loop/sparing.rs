@@ -81,7 +81,10 @@ impl TrialRunner {
         if self.stays_narrow(arm, state, now) {
             *opening_m = opening_m.min(self.narrow_opening_m(now));
         }
-        if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
+        if self.closes_around(state.openings_m[arm], now, *opening_m) {
+            *to = now.object.with_z(to.z.min(now.hand.z));
+            state.velocities[arm] = DVec3::ZERO;
+        } else if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
             (to.x, to.y) = (now.object.x, now.object.y);
         }
     }
@@ -112,6 +115,17 @@ impl TrialRunner {
             && (to.z < now.hand.z || opening_m < commanded_m)
             && to.z < now.object.z + GRASP_M
             && (now.object - to).truncate().length() < OFF_CENTRE_M
+    }
+
+    /// Returns whether the object is between the pads of a gripper that is commanded to `commanded_m` and closes to
+    /// `opening_m`, metres, but does not hold it yet.
+    fn closes_around(&self, commanded_m: f64, now: &ArmObservation, opening_m: f64) -> bool {
+        let to_object = now.object - now.hand;
+        opening_m < commanded_m
+            && now.opening_m > self.config.trained_half_m + OPEN_M
+            && !holds(commanded_m, now)
+            && to_object.truncate().length() < BETWEEN_M
+            && to_object.z.abs() < BESIDE_M
     }
 
     /// Returns what the arms observe, with the opening that a gripper has in the training world if it holds an object.
