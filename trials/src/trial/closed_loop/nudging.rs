@@ -163,7 +163,7 @@ impl TrialRunner {
     }
 
     /// The horizontal direction across the closing direction of the hand of `arm`, own frame.
-    fn across(&self, arm: usize, state: &LoopState) -> DVec3 {
+    pub(super) fn across(&self, arm: usize, state: &LoopState) -> DVec3 {
         let placed = &self.mapping.cell().arms[arm];
         let in_world = tool_axes(placed, &state.at[arm]).y_axis;
         let own = DQuat::from_rotation_z(-placed.yaw_rad) * in_world;

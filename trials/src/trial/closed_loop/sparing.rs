@@ -55,8 +55,9 @@ impl TrialRunner {
                 self.prepare_grasp(arm, state, now, wanted);
             }
             let to = &mut wanted.hands[arm];
+            let across = self.across(arm, state);
             let moves_away =
-                |other| other != arm && self.pushes_from_its_arm([arm, other], seen, *to);
+                |other| other != arm && self.pushes_from_its_arm([arm, other], seen, *to, across);
             if self.pushes_out_of_reach(now, *to, goals[arm]) || (0..seen.len()).any(moves_away) {
                 *to = self.mapping.reachable_hand(now.hand + DVec3::Z * RISE_M);
                 state.velocities[arm] = DVec3::ZERO;
@@ -81,7 +82,10 @@ impl TrialRunner {
         if self.stays_narrow(arm, state, now) {
             *opening_m = opening_m.min(self.narrow_opening_m(now));
         }
-        if self.closes_around(state.openings_m[arm], now, *opening_m) {
+        if self.opens_beside(now, *to, *opening_m) {
+            *to = now.hand;
+            state.velocities[arm] = DVec3::ZERO;
+        } else if self.closes_around(state.openings_m[arm], now, *opening_m) {
             *to = now.object.with_z(to.z.min(now.hand.z));
             state.velocities[arm] = DVec3::ZERO;
         } else if self.grasps(state.openings_m[arm], now, *to, *opening_m) {
@@ -114,7 +118,8 @@ impl TrialRunner {
             && !holds(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
             && to.z < now.object.z + GRASP_M
-            && (now.object - to).truncate().length() < OFF_CENTRE_M
+            && ((now.object - to).truncate().length() < OFF_CENTRE_M
+                || (now.object - now.hand).truncate().length() < BETWEEN_M)
     }
 
     /// Returns whether the object is between the pads of a gripper that is commanded to `commanded_m` and closes to
@@ -126,6 +131,17 @@ impl TrialRunner {
             && !holds(commanded_m, now)
             && to_object.truncate().length() < BETWEEN_M
             && to_object.z.abs() < BESIDE_M
+    }
+
+    /// Returns whether a gripper beside its object, which is not between its pads, opens to `opening_m` metres while the hand
+    /// moves `to` (own frame, metres) the object, before the object fits between its pads.
+    fn opens_beside(&self, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
+        let to_object = now.object - now.hand;
+        opening_m > now.opening_m
+            && now.opening_m < self.narrow_opening_m(now)
+            && to_object.z.abs() < self.config.trained_half_m
+            && (BETWEEN_M..NEAR_M).contains(&to_object.truncate().length())
+            && (to - now.hand).truncate().dot(to_object.truncate()) > 0.0
     }
 
     /// Returns what the arms observe, with the opening that a gripper has in the training world if it holds an object.
@@ -169,23 +185,48 @@ impl TrialRunner {
     }
 
     /// Returns whether the hand of the first arm, or what it holds, would push the object of the other arm to where that
-    /// arm's hand cannot follow if it moves `to`, own frame of the first arm, metres.
+    /// arm's hand cannot follow if it moves `to`, own frame of the first arm, metres. `across` is the direction across the
+    /// closing direction of its gripper.
     fn pushes_from_its_arm(
+        &self,
+        arms: [usize; 2],
+        seen: &[ArmObservation],
+        to: DVec3,
+        across: DVec3,
+    ) -> bool {
+        let now = &seen[arms[0]];
+        if (now.object - now.hand).length() < HELD_M {
+            let half_m = self.config.trained_half_m;
+            let lowered = DVec3::NEG_Z * half_m;
+            return self.moves_from_its_arm(
+                arms,
+                seen,
+                [now.hand + lowered, to + lowered],
+                2.0 * half_m,
+            );
+        }
+        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + 0.005);
+        [DVec3::ZERO, pad, -pad]
+            .into_iter()
+            .any(|part| self.moves_from_its_arm(arms, seen, [now.hand + part, to + part], AHEAD_M))
+    }
+
+    /// Returns whether something that moves between two positions, own frame of the first arm, metres, and pushes the
+    /// object of the other arm `ahead_m` metres ahead, would bring it to where that arm's hand cannot follow.
+    fn moves_from_its_arm(
         &self,
         [arm, other]: [usize; 2],
         seen: &[ArmObservation],
-        to: DVec3,
+        [from, to]: [DVec3; 2],
+        ahead_m: f64,
     ) -> bool {
-        let now = &seen[arm];
         let others = seen[other].object;
         let object = self.mapping.object_in_world(ArmIndex(other), others);
         let object = self.mapping.object_in_own(ArmIndex(arm), object);
-        let is_at_hand = (now.object - now.hand).length() < HELD_M;
+        let lowest_m = from.z.min(to.z);
         let half_m = self.config.trained_half_m;
-        let ahead_m = if is_at_hand { 2.0 * half_m } else { AHEAD_M };
-        let lowest_m = now.hand.z.min(to.z) - if is_at_hand { half_m } else { 0.0 };
-        let to_object = (object - now.hand).truncate();
-        let way = (to - now.hand).truncate();
+        let to_object = (object - from).truncate();
+        let way = (to - from).truncate();
         let aside_m = way.normalize_or_zero().perp_dot(to_object).abs();
         let gap_m = to_object.length() - ahead_m;
         if lowest_m >= object.z + half_m
