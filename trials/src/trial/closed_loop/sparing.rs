@@ -34,6 +34,8 @@ const OFF_CENTRE_M: f64 = 0.035;
 pub(super) const AHEAD_M: f64 = 0.045;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
 const BEYOND_M: f64 = 0.001;
+/// A hand that grasps does not push the object of another arm farther than this in one step, metres.
+const MOVED_M: f64 = 0.02;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
@@ -237,6 +239,9 @@ impl TrialRunner {
             return false;
         }
         let moved = (way - way.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
+        if self.config.layout.task.grasps() && moved.length() > MOVED_M {
+            return true;
+        }
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
         let then = self.mapping.object_in_own(ArmIndex(other), then);
         let behind = (then - others).normalize_or_zero() * self.behind_m();
