@@ -68,8 +68,8 @@ impl TrialRunner {
         Ok(())
     }
 
-    /// Pushes with the closed gripper of `arm`, which comes from above and rises again. Returns whether the hand got to both
-    /// ends of the push.
+    /// Pushes with the closed gripper of `arm`, which comes from above and rises again. An object that it holds is set down
+    /// first. Returns whether the hand got to both ends of the push.
     pub(super) fn carry_out(
         &self,
         rig: &mut TrialRig<'_>,
@@ -82,9 +82,15 @@ impl TrialRunner {
         let blocks = self.observed_blocks(objects, None);
         let above_m = 2.0 * f64::from(self.config.block.half_m) + ABOVE_M;
         let hand = self.hands(state)[arm];
+        let down = hand.with_z(hand.z.min(self.config.trained_half_m));
         let raised = hand.with_z(above_m.min(hand.z + RISE_M));
         let grasps = self.config.layout.task.grasps();
         let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
+        if grasps && self.lying(objects).nth(arm) == Some(false) {
+            let holding_m = state.openings_m[arm];
+            self.move_hand(rig, state, arm, (down, holding_m), &blocks)?;
+            self.move_hand(rig, state, arm, (self.hands(state)[arm], open_m), &blocks)?;
+        }
         let ways = [
             (raised, open_m),
             (from.with_z(raised.z), 0.0),

@@ -52,7 +52,7 @@ impl TrialRunner {
 
     /// Returns the pushes that may bring the object of `owner` back, each with the arm that makes it and in its frame, best
     /// first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the hand of
-    /// `owner` can get at its object. Arms that hold their objects above the table make none.
+    /// `owner` can get at its object.
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
         let object = self.mapping.object_in_own(owner, objects[owner.0].at_m);
         let away_m = if self.config.layout.task.grasps() { EDGE_M } else { AHEAD_M };
@@ -65,7 +65,6 @@ impl TrialRunner {
         let ways = [to_goal, to_goal.with_x(0.0), to_goal.with_y(0.0)];
         let half_m = f64::from(self.config.block.half_m);
         let corner_m = std::f64::consts::SQRT_2 * half_m;
-        let lying: Vec<bool> = self.lying(objects).collect();
         let mut recalls = Vec::new();
         for way in ways.into_iter().filter(|way| way.length() > UNIT_M) {
             let along = way.normalize();
@@ -75,7 +74,7 @@ impl TrialRunner {
             let n_units = units.find(is_back).map_or(n_units, |n| n + 1.0);
             let from = object - along * (corner_m + PADS_M + GAP_M);
             let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
-            recalls.extend((0..objects.len()).filter(|arm| lying[*arm]).map(|arm| {
+            recalls.extend((0..objects.len()).map(|arm| {
                 let seen = |own| {
                     let at = self.mapping.object_in_world(owner, own);
                     self.mapping.object_in_own(ArmIndex(arm), at)
@@ -98,18 +97,13 @@ mod tests {
     use crate::trial::{TrialMode, test_config};
 
     fn recalls(task: Task, object: DVec3, goal: DVec3) -> Vec<(usize, Push)> {
-        recalls_beside(task, object, goal, 0.0)
-    }
-
-    /// Returns the pushes of the first object while the second one is `held_m` above the table.
-    fn recalls_beside(task: Task, object: DVec3, goal: DVec3, held_m: f64) -> Vec<(usize, Push)> {
         let runner = TrialRunner::new(test_config(task, TrialMode::ClosedLoop, 1)).unwrap();
         let pose = |(arm, own)| ObjectPose {
             at_m: runner.mapping.object_in_world(ArmIndex(arm), own),
             turn: DQuat::IDENTITY,
             time_s: 0.0,
         };
-        let objects = [(0, object), (1, DVec3::new(0.1, 0.1, object.z + held_m))].map(pose);
+        let objects = [(0, object), (1, DVec3::new(0.1, 0.1, object.z))].map(pose);
         runner.recalls(ArmIndex(0), &objects, goal)
     }
 
@@ -153,8 +147,6 @@ mod tests {
         let far = DVec3::new(farthest(DVec3::X).x - 0.035, 0.05, 0.03);
         let found = recalls(Task::SharedPush, far, goal);
         assert_eq!((found[0].0, found[found.len() - 1].0), (1, 0), "{found:?}");
-        let held = recalls_beside(Task::SharedPush, far, goal, 0.1);
-        assert!(held.iter().all(|(arm, _)| *arm == 0), "the other arm keeps its object: {held:?}");
         // Toward the goal of the first arm, seen from the other one, which faces it.
         let Push { from, to } = &found[0].1;
         assert!(to.x > from.x && (to.y - from.y).abs() < 1e-6, "{from} {to}");

@@ -1,7 +1,8 @@
 //! Changes to the steps of a policy that keep objects where hands can grasp them or push them back.
 //!
-//! The training world's hand closes its gripper while it moves, an arm does so after each step. Pads that close too early
-//! end on the edge of their object, pads that grasp it off its middle lose it, and a hand that misses it pushes it ahead.
+//! The training world's hand opens and closes its gripper while it moves, an arm does so after each step. Pads that close too
+//! early end on the edge of their object, pads that grasp it off its middle or close too late lose it, pads that open too
+//! late push it ahead, and so does a hand that misses it.
 
 use glam::{DVec3, EulerRot};
 use tandem_core::ArmIndex;
@@ -32,16 +33,20 @@ const GRASP_M: f64 = 0.07;
 const OFF_CENTRE_M: f64 = 0.035;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
 pub(super) const AHEAD_M: f64 = 0.045;
+/// Distance from the inner side of a pad to its middle, metres.
+const PAD_M: f64 = 0.005;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
 const BEYOND_M: f64 = 0.001;
-/// A hand that grasps does not push the object of another arm farther than this in one step, metres.
+/// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects may end
+/// up side by side at the edge of the table's area.
 const MOVED_M: f64 = 0.02;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm: they rise. Grippers
-    /// that grasp also [close when and where they should](Self::prepare_grasp).
+    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm, or that grasp and
+    /// would push the other arm's object: they rise. Grippers that grasp also [open and close when and where they
+    /// should](Self::prepare_grasp).
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
@@ -69,7 +74,8 @@ impl TrialRunner {
 
     /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further until
     /// its pads are beside the object, and one that another object has held up opens no wider than its own needs. A hand
-    /// that is about to grasp goes to the middle of its object.
+    /// that is about to grasp goes to the middle of its object, and stays there until its gripper holds the object. One
+    /// beside its object stays where it is until the object fits between its pads.
     fn prepare_grasp(
         &self,
         arm: usize,
@@ -135,8 +141,8 @@ impl TrialRunner {
             && to_object.z.abs() < BESIDE_M
     }
 
-    /// Returns whether a gripper beside its object, which is not between its pads, opens to `opening_m` metres while the hand
-    /// moves `to` (own frame, metres) the object, before the object fits between its pads.
+    /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
+    /// moves `to` (own frame, metres) the object.
     fn opens_beside(&self, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         let to_object = now.object - now.hand;
         opening_m > now.opening_m
@@ -186,9 +192,9 @@ impl TrialRunner {
         beyond(to) > beyond(now.hand) + BEYOND_M
     }
 
-    /// Returns whether the hand of the first arm, or what it holds, would push the object of the other arm to where that
-    /// arm's hand cannot follow if it moves `to`, own frame of the first arm, metres. `across` is the direction across the
-    /// closing direction of its gripper.
+    /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of the
+    /// other arm where it [should not](Self::disturbs) if it moves `to`, own frame of the first arm, metres. `across` is the
+    /// direction across the closing direction of its gripper.
     fn pushes_from_its_arm(
         &self,
         arms: [usize; 2],
@@ -197,25 +203,23 @@ impl TrialRunner {
         across: DVec3,
     ) -> bool {
         let now = &seen[arms[0]];
+        let half_m = self.config.trained_half_m;
         if (now.object - now.hand).length() < HELD_M {
-            let half_m = self.config.trained_half_m;
-            let lowered = DVec3::NEG_Z * half_m;
-            return self.moves_from_its_arm(
-                arms,
-                seen,
-                [now.hand + lowered, to + lowered],
-                2.0 * half_m,
-            );
+            let lowest = DVec3::NEG_Z * half_m;
+            let way = [now.hand, to].map(|hand| hand + lowest);
+            return self.disturbs(arms, seen, way, 2.0 * half_m);
         }
-        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + 0.005);
-        [DVec3::ZERO, pad, -pad]
-            .into_iter()
-            .any(|part| self.moves_from_its_arm(arms, seen, [now.hand + part, to + part], AHEAD_M))
+        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_M);
+        let pads = if self.config.layout.task.grasps() { vec![pad, -pad] } else { Vec::new() };
+        std::iter::once(DVec3::ZERO)
+            .chain(pads)
+            .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], AHEAD_M))
     }
 
-    /// Returns whether something that moves between two positions, own frame of the first arm, metres, and pushes the
-    /// object of the other arm `ahead_m` metres ahead, would bring it to where that arm's hand cannot follow.
-    fn moves_from_its_arm(
+    /// Returns whether something of the first arm that moves between two positions, own frame, metres, with objects
+    /// `ahead_m` metres ahead of it, would push the object of the other arm to where that arm's hand cannot follow. A
+    /// gripper that grasps should not push it [at all](MOVED_M) either.
+    fn disturbs(
         &self,
         [arm, other]: [usize; 2],
         seen: &[ArmObservation],
@@ -328,6 +332,68 @@ mod tests {
         let holding = ArmObservation { opening_m: 0.054, ..seen(object + off, object) };
         let dragged = object + 0.5 * off;
         assert_eq!(step(pick, holding, dragged), dragged, "it holds the object");
+    }
+
+    #[test]
+    fn a_hand_stays_at_its_object_until_its_gripper_holds_it() {
+        let object = DVec3::new(0.1, 0.0, 0.028);
+        let away = object + DVec3::new(-0.05, -0.02, 0.04);
+        let step = |now, to| spared(Task::SharedPickAndPlace, now, to).0;
+        assert_eq!(step(seen(object, object), away), object);
+        let held = ArmObservation { opening_m: 0.054, ..seen(object, object) };
+        assert_eq!(step(held, away), away);
+        let beside = object - DVec3::X * 0.03;
+        let back = beside - DVec3::X * 0.03;
+        assert_eq!(step(seen(beside, object), back), back, "the object is not between the pads");
+        let above = object.with_z(0.1);
+        let descending = away.with_z(0.06);
+        let centred = object.with_z(descending.z);
+        assert_eq!(step(seen(above, object), descending), centred, "above its object");
+    }
+
+    #[test]
+    fn a_hand_beside_its_object_waits_until_its_gripper_is_open() {
+        let object = DVec3::new(0.1, 0.0, 0.028);
+        let hand = object - DVec3::X * 0.07;
+        let (toward, back) = (hand + DVec3::X * 0.03, hand - DVec3::X * 0.03);
+        let step = |opening_m: f64, now, to| {
+            let now = ArmObservation { opening_m, ..now };
+            spared(Task::SharedPickAndPlace, now, to).0
+        };
+        // The gripper opens to 3 cm on each side.
+        let beside = seen(hand, object);
+        assert_eq!(step(0.02, beside, toward), hand);
+        assert_eq!(step(0.02, beside, back), back);
+        assert_eq!(step(0.05, beside, toward), toward, "it closes");
+        let above = seen(hand + DVec3::Z * 0.05, object);
+        assert_eq!(step(0.02, above, toward), toward);
+    }
+
+    #[test]
+    fn a_hand_rises_instead_of_pushing_the_other_arms_object_with_a_pad() {
+        let pushed = |task, above_m: f64| {
+            let mut runner = runner(task);
+            let start = runner.start(0).unwrap();
+            let at = runner.mapping.cell().ready(0.2).unwrap();
+            let mut state = LoopState::new(&start, &at);
+            let across = runner.across(0, &state);
+            let pad = DVec3::new(-across.y, across.x, 0.0) * 0.055;
+            let hand = DVec3::new(0.1, 0.0, 0.03 + above_m);
+            // In front of one of the pads.
+            let object = (hand + across * 0.06 + pad).with_z(0.03);
+            let others = runner.mapping.object_in_world(ArmIndex(0), object);
+            let others = runner.mapping.object_in_own(ArmIndex(1), others);
+            let now =
+                [seen(hand, hand - DVec3::X * 0.3), seen(DVec3::new(0.0, -0.15, 0.2), others)];
+            let to = hand + across * 0.04;
+            let mut wanted =
+                WantedStep { hands: vec![to, now[1].hand], openings_m: vec![0.05; 2], blocks: &[] };
+            runner.spare_objects(&mut state, &now, &[DVec3::ZERO; 2], &mut wanted);
+            wanted.hands[0].z > hand.z + 0.05
+        };
+        assert!(pushed(Task::SharedPickAndPlace, 0.0));
+        assert!(!pushed(Task::SharedPickAndPlace, 0.1), "above the object");
+        assert!(!pushed(Task::SharedPush, 0.0), "a policy that pushes has a closed gripper");
     }
 
     #[test]
