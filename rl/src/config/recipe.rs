@@ -54,6 +54,8 @@ impl RunConfig {
             advice: AdviceConfig {
                 strategy: if n_arms == 1 || layout.single_arm().is_none() {
                     "none"
+                } else if tandem && carries_past_others(layout) {
+                    "mc-q:0.4"
                 } else {
                     "mc-q:0.1"
                 }
@@ -165,7 +167,7 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
             match (built_in.n_arms, built_in.task.grasps()) {
                 (1, false) => 100_000,
                 (1, true) | (_, false) => 200_000,
-                (_, true) => 400_000,
+                (_, true) => 600_000,
             }
         }
         (Recipe::Tandem, Some(layout)) if !layout.task.grasps() && layout.n_arms == 1 => 200_000,
