@@ -20,6 +20,7 @@ use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 mod episodes;
+mod grasping;
 mod nudging;
 mod order;
 mod progress;
