@@ -17,8 +17,8 @@ use crate::trial::{ActionSource, NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
 pub(super) const FRICTIONS: [f32; 8] = [0.8, 1.2, 0.9, 1.1, 0.85, 1.15, 0.95, 1.05];
-/// Added to the number of a trial, this is that of the noise on the first copy; with its multiples, the others follow. No
-/// trial has such a number.
+/// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial has
+/// such a number.
 const FIRST_NOISE: u64 = 1 << 48;
 
 impl TrialRunner {

@@ -79,8 +79,7 @@ impl TrialRunner {
     /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it moves
     /// `to` (own frame, metres) with an opening of `opening_m`.
     fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
-        now.opening_m > self.config.trained_half_m + OPEN_M
-            && !holds(commanded_m, now)
+        self.is_empty(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
             && to.z < now.object.z + GRASP_M
             && ((now.object - to).truncate().length() < OFF_CENTRE_M
@@ -92,10 +91,15 @@ impl TrialRunner {
     fn closes_around(&self, commanded_m: f64, now: &ArmObservation, opening_m: f64) -> bool {
         let to_object = now.object - now.hand;
         opening_m < commanded_m
-            && now.opening_m > self.config.trained_half_m + OPEN_M
-            && !holds(commanded_m, now)
+            && self.is_empty(commanded_m, now)
             && to_object.truncate().length() < BETWEEN_M
             && to_object.z.abs() < BESIDE_M
+    }
+
+    /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and holds
+    /// nothing.
+    fn is_empty(&self, commanded_m: f64, now: &ArmObservation) -> bool {
+        now.opening_m > self.config.trained_half_m + OPEN_M && !holds(commanded_m, now)
     }
 
     /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
