@@ -11,7 +11,6 @@ import contextlib
 import csv
 import dataclasses
 import json
-import math
 import os
 import shlex
 import shutil
@@ -144,20 +143,32 @@ def rows_of(path):
         return list(csv.DictReader(lines))
 
 
+def program(options):
+    """The `tandem` program."""
+    if shutil.which(options.tandem) is None:
+        raise Wrong(f"there is no program {options.tandem}: cargo build --release, then --tandem target/release/tandem")
+    return options.tandem
+
+
+def serve_command(env, *, reports_contacts):
+    """The command that serves an environment to Tandem."""
+    command = [sys.executable, "-m", "tandem.serve", env]
+    if env.startswith("Fetch"):
+        command += ["--reflection", "fetch"]
+    if reports_contacts:
+        command.append("--reports-contacts")
+    return shlex.join(command)
+
+
 def tandem_command(piece, run, options):
     resume = run.exists()
-    command = [options.tandem, "train", "--out", str(run), "--json", "--max-env-steps", str(options.max_env_steps)]
+    command = [program(options), "train", "--out", str(run), "--json", "--max-env-steps", str(options.max_env_steps)]
     command += ["--max-minutes", str(options.max_minutes)]
     if options.workers:
         command += ["--workers", str(options.workers)]
     is_built_in = piece.env == "tandem/Push-v0"
     if not is_built_in:
-        serve = [sys.executable, "-m", "tandem.serve", piece.env]
-        if piece.env.startswith("Fetch"):
-            serve += ["--reflection", "fetch"]
-        if piece.reports_contacts:
-            serve.append("--reports-contacts")
-        command += ["--env-command", shlex.join(serve)]
+        command += ["--env-command", serve_command(piece.env, reports_contacts=piece.reports_contacts)]
     if resume:
         return [*command, "--resume"]
     command += ["--seed", str(piece.seed)]
@@ -262,53 +273,22 @@ def show(options):
 
 def composed(options):
     """Evaluates the one-arm teacher driving each arm of the two-arm environment, without a student."""
-    import gymnasium
-    import numpy as np
-
-    import tandem
-
     teacher = options.runs / teacher_name(options.task) / "policy" / "best.safetensors"
-    path = options.policy or teacher
-    if not path.exists():
-        raise Wrong(f"there is no policy {path}: run {teacher_name(options.task)}, or give --policy")
-    policy = tandem.load_policy(path)
-    env = gymnasium.make(TWO_FETCH[options.task], **({"distance": options.distance} if options.distance else {}))
-    both, each, touched = 0, np.zeros(2), 0
-    for seed in range(options.seed, options.seed + options.episodes):
-        observation, _ = env.reset(seed=seed)
-        over = touches = False
-        while not over:
-            own = {name: observation[name].reshape(2, -1) for name in ("observation", "desired_goal")}
-            action, _ = policy.predict(own)
-            observation, _, _, over, info = env.step(action.reshape(-1))
-            touches |= info["arm_contact"]
-        apart = (observation["achieved_goal"] - observation["desired_goal"]).reshape(2, 3)
-        each += np.linalg.norm(apart, axis=1) <= 0.05
-        both += info["is_success"]
-        touched += touches
-    low, high = wilson(both, options.episodes)
-    result = {
-        "task": options.task,
-        "episodes": options.episodes,
-        "success": both / options.episodes,
-        "success_low": round(low, 4),
-        "success_high": round(high, 4),
-        "success_per_arm": (each / options.episodes).tolist(),
-        "arm_contact": touched / options.episodes,
-        "policy_digest": policy.digest,
-    }
+    policy = options.policy or teacher
+    if not policy.exists():
+        raise Wrong(f"there is no policy {policy}: run {teacher_name(options.task)}, or give --policy")
+    serve = serve_command(TWO_FETCH[options.task], reports_contacts=True)
+    command = [program(options), "eval", "--composed-teachers", str(policy), "--env-command", serve, "--json"]
+    command += ["--episodes", str(options.episodes), "--seed", str(options.seed)]
+    print(shlex.join(command), file=sys.stderr)
+    evaluation = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if evaluation.returncode != 0:
+        raise Wrong(f"tandem eval ended with exit code {evaluation.returncode}")
+    result = evaluation.stdout.strip().splitlines()[-1]
     directory = options.runs / f"composed-fetch-{options.task}"
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "summary.json").write_text(json.dumps(result) + "\n", encoding="utf-8")
-    print(json.dumps(result))
-
-
-def wilson(hits, n):
-    """Wilson's 95 % interval of a share."""
-    z = 1.959963984540054
-    share, scale = hits / n, 1 + z * z / n
-    centre, spread = share + z * z / (2 * n), z * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+    (directory / "summary.json").write_text(result + "\n", encoding="utf-8")
+    print(result)
 
 
 def collect(options):
@@ -351,9 +331,9 @@ def parse():
     teachers.set_defaults(command=composed)
     teachers.add_argument("--task", choices=tuple(TWO_FETCH), default="push", help="[default: push]")
     teachers.add_argument("--policy", type=Path, metavar="FILE", help="one-arm policy [that of teacher-fetch-TASK-1]")
-    teachers.add_argument("--distance", type=float, metavar="M", help="between the arms [the environment's]")
     teachers.add_argument("--episodes", type=int, default=240, help="[default: 240]")
-    teachers.add_argument("--seed", type=int, default=777_000, help="of the first episode [default: 777000]")
+    teachers.add_argument("--seed", type=int, default=777, help="of the test goals [default: 777]")
+    teachers.add_argument("--tandem", default="tandem", help="the program [default: tandem]")
     commands.add_parser("collect", help=f"copies results to {RESULTS.relative_to(ROOT)}").set_defaults(command=collect)
     return parser.parse_args()
 
