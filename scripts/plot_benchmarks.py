@@ -4,8 +4,9 @@
 A run is a directory with metrics.jsonl (Tandem) or progress.csv (bench_sb3.py), or such a file; metrics.csv with the
 columns env_steps, wall_s and success is read as well. Processor seconds of Tandem are in processor.csv beside it, which
 scripts/benchmarks.py writes. The table has, for each run, the env steps, updates, minutes and processor seconds after
-which an evaluation first reached a success rate, and the last evaluation with its 95 % interval. Directories of
-another kind, such as those of composed teachers, are left out.
+which an evaluation first reached a success rate, the last evaluation and, if summary.json is beside it, the best policy
+on test goals, both with their 95 % intervals. Directories of another kind, such as those of composed teachers, are left
+out.
 """
 
 import argparse
@@ -28,7 +29,8 @@ class Wrong(Exception):
     """An error that is reported in one line."""
 
 
-KEYS = ("env_steps", "updates", "wall_s", "success", "success_low", "success_high", "processor_s")
+INTERVAL = ("success", "success_low", "success_high")
+KEYS = ("env_steps", "updates", "wall_s", *INTERVAL, "processor_s")
 
 
 def file_of(path):
@@ -59,6 +61,18 @@ def rows_of(file):
         return [json.loads(line) for line in lines] if file.suffix == ".jsonl" else list(csv.DictReader(lines))
 
 
+def test_of(file):
+    """Success of the run's best policy on test goals, with its interval; None if it is not recorded."""
+    summary = file.parent / "summary.json"
+    if not summary.is_file():
+        return None
+    try:
+        content = json.loads(summary.read_text(encoding="utf-8"))
+        return {key: float(content[key]) for key in INTERVAL} if "success" in content else None
+    except (OSError, ValueError, KeyError) as error:
+        raise Wrong(f"cannot read {summary}: {error}") from None
+
+
 def cost(row):
     """What a run had spent at an evaluation; None for what is not recorded."""
     updates, processor_s = row.get("updates"), row.get("processor_s")
@@ -70,7 +84,7 @@ def cost(row):
     }
 
 
-def measures(path, evaluations):
+def measures(path, evaluations, test):
     """What the table shows of a run; None where a rate was not reached."""
     reached = {}
     for rate in RATES:
@@ -81,9 +95,8 @@ def measures(path, evaluations):
         "run": str(path),
         "evaluations": len(evaluations),
         **cost(last),
-        "success": last["success"],
-        "success_low": last.get("success_low"),
-        "success_high": last.get("success_high"),
+        **{key: last.get(key) for key in INTERVAL},
+        "test": test,
         "best_success": max(row["success"] for row in evaluations),
         "reached": reached,
     }
@@ -98,17 +111,22 @@ def text_of(spent):
     return " / ".join([*cells, "–" if processor_s is None else f"{processor_s:,.0f}"])
 
 
+def success_text(values):
+    """Success with its interval, in one cell of the table."""
+    if values is None:
+        return "–"
+    interval = "" if values["success_low"] is None else f" [{values['success_low']:.3f}, {values['success_high']:.3f}]"
+    return f"{values['success']:.3f}{interval}"
+
+
 def print_table(results):
     print("Each cell: env steps / updates / minutes / processor seconds.\n")
     heads = [f"to {rate:.0%}" for rate in RATES]
-    print("| run | in all | " + " | ".join(heads) + " | last evaluation | best |")
-    print("|---" * (4 + len(RATES)) + "|")
+    print("| run | in all | " + " | ".join(heads) + " | last evaluation | best | test goals |")
+    print("|---" * (5 + len(RATES)) + "|")
     for result in results:
-        interval = ""
-        if result["success_low"] is not None:
-            interval = f" [{result['success_low']:.3f}, {result['success_high']:.3f}]"
         cells = [Path(result["run"]).name, text_of(result), *map(text_of, result["reached"].values())]
-        cells += [f"{result['success']:.3f}{interval}", f"{result['best_success']:.3f}"]
+        cells += [success_text(result), f"{result['best_success']:.3f}", success_text(result["test"])]
         print("| " + " | ".join(cells) + " |")
 
 
@@ -146,7 +164,8 @@ def main():
     empty = [str(path) for path, evaluations in runs if not evaluations]
     if empty:
         raise Wrong(f"no evaluations in {', '.join(empty)}")
-    results = [measures(path, evaluations) for path, evaluations in runs]
+    tests = [test_of(file) for _, file in files if file is not None]
+    results = [measures(path, evaluations, test) for (path, evaluations), test in zip(runs, tests, strict=True)]
     if arguments.out:
         plot(runs, arguments.x, arguments.out)
     print(json.dumps(results)) if arguments.json else print_table(results)
