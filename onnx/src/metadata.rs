@@ -18,8 +18,6 @@ pub const POLICY_DIGEST: &str = "policy_digest";
 /// Start of the keys of the policy's own metadata.
 pub const TRAINING: &str = "training.";
 
-/// Seconds per control step.
-const CONTROL_STEP_S: &str = "0.04";
 const FRAME: &str = "each arm's own frame: origin in the centre of its workspace on the table, x away from its base, \
     z up; the numbers of several arms are concatenated in arm order";
 
@@ -71,7 +69,7 @@ fn of_vectors(layout: Layout) -> [(&'static str, String); 5] {
         ("goal", parts(&GOAL, &|arm| layout.goal_of(arm))),
         ("action", parts(&ACTION, &|arm| layout.action_of(arm))),
         ("frame", FRAME.to_owned()),
-        ("control_step_s", CONTROL_STEP_S.to_owned()),
+        ("control_step_s", layout.task.world().control_step_s().to_string()),
     ]
 }
 

@@ -41,6 +41,14 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
 }
 
 #[test]
+fn a_model_names_the_duration_of_a_control_step_of_its_world() {
+    for (name, step_s) in [("teacher-push-classic", "0.04"), ("teacher-push", "0.25")] {
+        let actor = Model::decode(&export::actor(&shipped(name)).unwrap()).unwrap();
+        assert_eq!(actor.metadata["control_step_s"], step_s, "{name}");
+    }
+}
+
+#[test]
 fn a_policy_without_a_critic_says_so_and_values_nothing() {
     let policy = shipped("teacher-push-classic");
     let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
