@@ -31,7 +31,9 @@ pub(super) fn print(file: &Path) -> Result<(), Failed> {
     }
     let last = log.last_observation.as_ref().zip(log.transitions.last());
     last.map_or(Ok(()), |(observation, LoggedTransition { goal, .. })| {
-        let is_success = task.is_success(observation, goal);
+        let observations = log.transitions.iter().map(|step| &step.observation);
+        let counted = observations.chain([observation]).rev().take(task.success_steps());
+        let is_success = counted.into_iter().all(|observation| task.is_success(observation, goal));
         output::print(line(" end", &cells(task, observation, goal, 0), ""))?;
         output::print(if is_success { "success" } else { "failure" })
     })

@@ -46,6 +46,24 @@ pub struct TransitionRecord<'a> {
     pub budget_left: Option<u64>,
 }
 
+/// For how many consecutive steps, up to the latest one, the arms succeed.
+struct Successes {
+    /// Each arm by itself.
+    per_arm: Vec<usize>,
+    /// All arms together.
+    all: usize,
+}
+
+impl Successes {
+    fn count(&mut self, layout: &TaskSpec, observation: &[f32], goal: &[f32]) {
+        let next = |n_steps: usize, succeeds: bool| if succeeds { n_steps + 1 } else { 0 };
+        for (n_steps, arm) in self.per_arm.iter_mut().zip(layout.arms()) {
+            *n_steps = next(*n_steps, layout.arm_succeeds(arm, observation, goal));
+        }
+        self.all = next(self.all, layout.is_success(observation, goal));
+    }
+}
+
 /// Writes one episode to one MCAP file.
 ///
 /// The file is named `NAME.mcap.part` until [`finish`](Self::finish) renames it, so a file without that suffix is
@@ -61,6 +79,7 @@ pub struct EpisodeRecorder {
     markers: Option<GoalMarkers>,
     goal: Vec<f32>,
     stats: pb::Stats,
+    successes: Successes,
     time_ns: u64,
     /// Whether the log is flushed while it is written.
     is_flushed: bool,
@@ -79,12 +98,13 @@ impl EpisodeRecorder {
         let channels = Channels::start(&mut file, metadata, has_scene);
         let channels = channels.map_err(file.write_error())?;
         Ok(Self {
-            layout,
             file,
             channels,
             markers,
             goal: Vec::new(),
             stats: pb::Stats::default(),
+            successes: Successes { per_arm: vec![0; layout.n_arms()], all: 0 },
+            layout,
             time_ns: 0,
             is_flushed: true,
         })
@@ -111,6 +131,7 @@ impl EpisodeRecorder {
         self.set_time(scene, transition.step)?;
         self.goal = transition.goal.to_vec();
         self.update_stats(scene, transition);
+        self.successes.count(&self.layout, transition.observation, &self.goal);
         let caption = self.step_caption(transition);
         let state = State { scene, observation: transition.observation, caption };
         self.write_step(&state, transition).map_err(self.file.write_error())
@@ -130,6 +151,9 @@ impl EpisodeRecorder {
         let scene = scene.into();
         self.set_time(scene, self.stats.step + 1)?;
         self.set_distances(scene, observation);
+        if !self.goal.is_empty() {
+            self.successes.count(&self.layout, observation, &self.goal);
+        }
         let outcome = self.outcome(observation);
         let result = if outcome.success { "success" } else { "failure" };
         let caption = format!("{result}\nreturn {:.0}", self.stats.episode_return);
@@ -191,7 +215,7 @@ impl EpisodeRecorder {
         self.stats.goal_distance_m = scene.map(goal_distances_m).unwrap_or_default();
     }
 
-    /// Returns for each arm whether its goal is achieved; there is no goal before the first step.
+    /// Returns for each arm whether it succeeds now; there is no goal before the first step.
     fn success_per_arm(&self, observation: &[f32]) -> Vec<bool> {
         let at_goal =
             |arm| !self.goal.is_empty() && self.layout.arm_succeeds(arm, observation, &self.goal);
@@ -214,12 +238,13 @@ impl EpisodeRecorder {
         caption
     }
 
+    /// Returns the outcome as an evaluation counts it.
     fn outcome(&self, observation: &[f32]) -> pb::Outcome {
-        let success_per_arm = self.success_per_arm(observation);
+        let lasts = |n_steps: &usize| *n_steps >= self.layout.success_steps();
         pb::Outcome {
             observation: observation.to_vec(),
-            success: success_per_arm.iter().all(|success| *success),
-            success_per_arm,
+            success: lasts(&self.successes.all),
+            success_per_arm: self.successes.per_arm.iter().map(lasts).collect(),
             stats: Some(self.stats.clone()),
         }
     }
