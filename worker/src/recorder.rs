@@ -147,7 +147,7 @@ mod tests {
 
     use super::*;
     use crate::fakes::{FakeActor, FakeTeacher, LAYOUT, slot, terms};
-    use crate::ports::Simulator;
+    use crate::ports::{Act, Simulator};
     use crate::record::metadata_of;
     use crate::replay::replay_log;
     use crate::rollout::{play_slot, play_traced_slot};
@@ -198,6 +198,36 @@ mod tests {
             assert_eq!(step.budget_left, None, "unknown to this teacher");
         }
         replay_log(&log).expect("the same bits");
+    }
+
+    /// Asks the teacher in every second step.
+    struct AsksSometimes {
+        n_steps: usize,
+    }
+
+    impl Act for AsksSometimes {
+        fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+            FakeActor::Seeker.act(observations, goals, actions);
+        }
+
+        fn asks(&mut self, _observation: &[f32], _goal: &[f32], _action: &[f32]) -> bool {
+            self.n_steps += 1;
+            self.n_steps.is_multiple_of(2)
+        }
+    }
+
+    #[test]
+    fn advice_is_traced_on_the_step_on_which_the_student_asked() {
+        let (order, terms) = (slot(&[3], true), terms());
+        let mut teacher = FakeTeacher::new(|_, _, arm| arm == 0);
+        let actor = &mut AsksSometimes { n_steps: 0 };
+        let played = play_traced_slot(&mut simulator(), &order, &terms, actor, &mut teacher);
+        let (episode, trace) = played.expect("no step fails").remove(0);
+        assert_eq!(trace.advice.len(), episode.n_steps());
+        for (step_idx, advice) in trace.advice.iter().enumerate() {
+            assert_eq!(advice.arms.len(), if step_idx % 2 == 1 { 2 } else { 0 }, "{step_idx}");
+            assert_eq!(episode.advised_arms[step_idx] != 0, !advice.arms.is_empty());
+        }
     }
 
     #[test]

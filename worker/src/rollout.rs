@@ -231,8 +231,11 @@ fn take_advice(
     unit: AdviceUnit,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
-    let mut advised: Vec<&mut Rollout> =
-        rollouts.iter_mut().filter(|rollout| rollout.asks).collect();
+    let (mut advised, others): (Vec<&mut Rollout>, Vec<&mut Rollout>) =
+        rollouts.iter_mut().partition(|rollout| rollout.asks);
+    for trace in others.into_iter().filter_map(|rollout| rollout.trace.as_mut()) {
+        trace.advice.push(TracedAdvice::default());
+    }
     let Some(first) = advised.first() else {
         return Ok(());
     };
