@@ -32,10 +32,10 @@ pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit.
+/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. NaN is no achieved goal.
 #[must_use]
 pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
-    if distance > tolerance { REWARD_PENDING } else { REWARD_ACHIEVED }
+    if distance <= tolerance { REWARD_ACHIEVED } else { REWARD_PENDING }
 }
 
 /// Returns `true` if every object is within [`GOAL_TOLERANCE_M`] of its goal.
@@ -71,6 +71,7 @@ mod tests {
         assert_eq!(sparse_reward(&[0.0, 0.0, 0.051], &[0.0; 3]), REWARD_PENDING);
         assert_eq!(sparse_reward_within(0.04, 0.041), REWARD_PENDING);
         assert_eq!(sparse_reward_within(0.04, 0.039), REWARD_ACHIEVED);
+        assert_eq!(sparse_reward_within(0.04, f32::NAN), REWARD_PENDING);
     }
 
     #[test]

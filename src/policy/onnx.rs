@@ -76,7 +76,7 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
             anyhow::anyhow!(
                 "{}: the policy differs from the model by {:.1e}, because its numbers are too large for float32",
                 args.actor.display(),
-                differences[0].max(differences[1])
+                larger(differences[0], differences[1])
             ),
         ));
     }
@@ -134,5 +134,10 @@ fn largest_difference(got: &[f32], expected: &[f32]) -> f32 {
     let differences = got.iter().zip(expected);
     let relative =
         differences.map(|(got, expected)| (got - expected).abs() / expected.abs().max(1.0));
-    relative.fold(0.0, |largest: f32, next| if next.is_nan() { next } else { largest.max(next) })
+    relative.fold(0.0, larger)
+}
+
+/// Returns the larger number, or NaN if one of them is.
+const fn larger(a: f32, b: f32) -> f32 {
+    if a.is_nan() || a > b { a } else { b }
 }

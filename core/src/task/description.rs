@@ -127,7 +127,7 @@ impl Norm {
         let differences = a.iter().zip(b).map(|(a, b)| a - b);
         match self {
             Self::Euclidean => differences.map(|difference| difference * difference).sum::<f32>(),
-            Self::Maximum => differences.fold(0.0, |most, difference| most.max(difference.abs())),
+            Self::Maximum => differences.map(f32::abs).fold(0.0, larger),
         }
     }
 
@@ -136,7 +136,7 @@ impl Norm {
     pub const fn combined(self, first: f32, second: f32) -> f32 {
         match self {
             Self::Euclidean => first + second,
-            Self::Maximum => first.max(second),
+            Self::Maximum => larger(first, second),
         }
     }
 
@@ -148,6 +148,11 @@ impl Norm {
             Self::Maximum => accumulated,
         }
     }
+}
+
+/// Returns the larger number, or NaN if one of them is.
+const fn larger(a: f32, b: f32) -> f32 {
+    if a.is_nan() || a > b { a } else { b }
 }
 
 /// The first field in which two descriptions differ.
@@ -228,6 +233,10 @@ mod tests {
             assert_eq!(norm.distance(&a, &b), expected);
             let parts = [norm.accumulate(&a[..1], &b[..1]), norm.accumulate(&a[1..], &b[1..])];
             assert_eq!(norm.of_accumulated(norm.combined(parts[0], parts[1])), expected);
+            assert!(norm.distance(&[f32::NAN, 4.0], &[0.0; 2]).is_nan());
+            let parts = [norm.accumulate(&[f32::NAN], &[0.0]), norm.accumulate(&[4.0], &[0.0])];
+            assert!(norm.combined(parts[0], parts[1]).is_nan());
+            assert!(norm.combined(parts[1], parts[0]).is_nan());
         }
     }
 
