@@ -23,7 +23,7 @@ pub const EPISODE_STEPS: usize = 50;
 /// Distance between object and goal up to which the goal counts as achieved, metres.
 pub const GOAL_TOLERANCE_M: f32 = 0.05;
 
-/// A built-in manipulation task (section 4.1 of the paper) in one of two worlds.
+/// A built-in manipulation task in one of three worlds. Push and pick and place are those of the paper (section 4.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Task {
     /// Push an object across the table to its goal with a closed gripper, in the classic world.
@@ -175,6 +175,12 @@ impl Task {
     #[must_use]
     pub const fn shares_object(self) -> bool {
         matches!(self, Self::CarryBar)
+    }
+
+    /// Returns true if the paper has the task too.
+    #[must_use]
+    pub const fn is_in_paper(self) -> bool {
+        !self.shares_object()
     }
 
     /// Returns true if the arms grasp their objects; otherwise they push them with closed grippers.

@@ -45,7 +45,7 @@ impl TaskSetup {
         }
     }
 
-    /// Returns the built-in task, which is a task of the paper.
+    /// Returns the built-in task, if it is one.
     #[must_use]
     pub fn built_in(&self) -> Option<Task> {
         self.task.as_ref()?.parse().ok()
@@ -235,7 +235,8 @@ impl SeedGroup {
     #[must_use]
     pub fn paper(&self) -> Option<&'static PaperRow> {
         let is_student = self.setup.n_arms.is_none_or(|n_arms| n_arms == 2);
-        let may_be_of_paper = self.setup.task.is_none() || self.setup.built_in().is_some();
+        let may_be_of_paper =
+            self.setup.task.is_none() || self.setup.built_in().is_some_and(Task::is_in_paper);
         let strategy = self.strategy.as_ref().filter(|_| is_student && may_be_of_paper)?;
         Some(PaperRow::of(strategy)?.1)
     }

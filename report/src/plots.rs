@@ -95,7 +95,8 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
                 continue;
             }
             let reference = paper.zip(panel.letter).zip(section.setup.built_in());
-            let reference = reference.filter(|_| section.setup.n_arms != Some(1));
+            let reference =
+                reference.filter(|(_, task)| section.setup.n_arms != Some(1) && task.is_in_paper());
             let reference =
                 reference.map_or_else(String::new, |(([push, other], letter), task)| {
                     let number = if task.grasps() { other } else { push };
@@ -378,6 +379,18 @@ mod tests {
             let unique: BTreeSet<String> = plots.iter().map(|plot| text(plot)).collect();
             assert_eq!(unique.len(), 12, "{unique:?}");
         }
+    }
+
+    #[test]
+    fn a_task_that_the_paper_lacks_has_none_of_its_figures_and_values() {
+        let mut bar = plain("mc-q:0.1");
+        bar.configuration = bar.configuration.map(|text| text.replace("\"push\"", "\"carry-bar\""));
+        let comparison = Comparison::of(vec![bar], Vec::new());
+        assert!(comparison.sections[0].groups[0].paper().is_none());
+        let plots = comparison_plots(&comparison).unwrap();
+        assert!(plots.all().all(|plot| !plot.title.contains("Figure")));
+        let push = Comparison::of(vec![plain("mc-q:0.1")], Vec::new());
+        assert!(push.sections[0].groups[0].paper().is_some());
     }
 
     #[test]
