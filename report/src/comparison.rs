@@ -186,6 +186,11 @@ impl Section {
         self.groups.iter().all(SeedGroup::has_success_without_contact)
     }
 
+    /// Returns whether the task reports contacts; true if it is unknown.
+    pub(crate) fn reports_contacts(&self) -> bool {
+        self.groups.iter().flat_map(|group| &group.runs).all(Run::reports_contacts)
+    }
+
     /// Returns what the runs needed to reach the [`MILESTONES`] of `measure`.
     fn cost(&self, measure: Quantity) -> Table {
         let mut table = Table::new(
@@ -255,7 +260,9 @@ impl Section {
                 spread(&group.spread(collision_rate), three_digits),
             ]);
         }
-        table.rows.extend(self.baselines.iter().map(baseline_row));
+        let reports_contacts = self.reports_contacts();
+        let baselines = self.baselines.iter();
+        table.rows.extend(baselines.map(|baseline| baseline_row(baseline, reports_contacts)));
         table
     }
 }
@@ -315,7 +322,7 @@ fn collision_rate(run: &Run) -> Option<f64> {
     test.or_else(|| run.last().map(|row| row.collision_rate))
 }
 
-fn baseline_row(Baseline { label, test }: &Baseline) -> Vec<String> {
+fn baseline_row(Baseline { label, test }: &Baseline, reports_contacts: bool) -> Vec<String> {
     let (low, high) = test.interval;
     let none = || NONE.to_owned();
     vec![
@@ -328,7 +335,7 @@ fn baseline_row(Baseline { label, test }: &Baseline) -> Vec<String> {
         none(),
         none(),
         three_digits(test.success_joint),
-        three_digits(test.collision_rate),
+        if reports_contacts { three_digits(test.collision_rate) } else { none() },
     ]
 }
 

@@ -96,12 +96,14 @@ pub fn json(comparison: &Comparison) -> Value {
 }
 
 fn section_json(section: &Section) -> Value {
+    let reports_contacts = section.reports_contacts();
     let baselines = section.baselines.iter().map(|baseline| {
         let test = &baseline.test;
         json!({
             "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
             "success_low": test.interval.0, "success_high": test.interval.1,
-            "success_joint": test.success_joint, "collision_rate": test.collision_rate,
+            "success_joint": test.success_joint,
+            "collision_rate": reports_contacts.then_some(test.collision_rate),
             "success_without_contact": test.contacts.success_without_contact,
             "success_without_contact_low": test.contacts.success_without_contact_low,
             "success_without_contact_high": test.contacts.success_without_contact_high,
