@@ -35,6 +35,8 @@ pub struct MotionJournal {
     n_logs: u64,
     /// The stop in the latest state.
     stop: Option<StopView>,
+    /// Time of the latest state, on the clock of the bridge, seconds.
+    now_s: f64,
     /// The latest log could not be written, at this time.
     failed_s: Option<f64>,
 }
@@ -75,12 +77,14 @@ impl MotionJournal {
             open: None,
             n_logs: 0,
             stop: None,
+            now_s: 0.0,
             failed_s: None,
         })
     }
 
     /// Records a state. Times must not decrease. Failures are only logged.
     pub fn record(&mut self, view: &Arc<ArmsView>) {
+        self.now_s = view.time_s;
         let is_fault = self.is_new_fault(view);
         self.stop.clone_from(&view.stop);
         if self.open.as_ref().is_some_and(|log| log.is_over(view)) {
@@ -90,7 +94,7 @@ impl MotionJournal {
             self.begin(view);
         } else if let Some(log) = &mut self.open {
             let written = log.record(view);
-            self.check(written, view.time_s);
+            self.check(written);
         }
         self.recent.push_back(Arc::clone(view));
         let is_old = |oldest: &Arc<ArmsView>| view.time_s - oldest.time_s > LEAD_S;
@@ -121,7 +125,7 @@ impl MotionJournal {
             OpenLog::begin(&self.directory.join(name), &self.metadata(view), view, &self.recent);
         match log {
             Ok(log) => self.open = Some(log),
-            Err(error) => self.check(Err(error), view.time_s),
+            Err(error) => self.check(Err(error)),
         }
     }
 
@@ -142,7 +146,6 @@ impl MotionJournal {
 
     fn close(&mut self) {
         let Some(log) = self.open.take() else { return };
-        let now_s = log.recorder.duration_s();
         let outcome = log.outcome.map_or(MotionOutcome::Unfinished, |(outcome, _)| outcome);
         let finished = log.recorder.finish(&outcome).and_then(|path| {
             let n_bytes = std::fs::metadata(&path).map_or(0, |metadata| metadata.len());
@@ -150,18 +153,18 @@ impl MotionJournal {
             self.budget.add(n_bytes)
         });
         let is_good = finished.is_ok();
-        self.check(finished.map(drop), now_s);
+        self.check(finished.map(drop));
         if is_good && self.failed_s.take().is_some() {
             tracing::info!("recording resumed");
         }
     }
 
     /// Pauses recording after a failure. Repeated failures are not logged again.
-    fn check(&mut self, written: Result<(), Error>, now_s: f64) {
+    fn check(&mut self, written: Result<(), Error>) {
         if let Err(error) = written {
             self.open = None;
             let error: &dyn std::error::Error = &error;
-            if self.failed_s.replace(now_s).is_none() {
+            if self.failed_s.replace(self.now_s).is_none() {
                 let directory = &self.directory;
                 tracing::warn!(?directory, error, "recording paused: the arms are not affected");
             }

@@ -18,9 +18,9 @@ pub struct TrialRow {
     /// Name of the policy; the JSON key is `subject`.
     #[serde(rename = "subject")]
     pub policy: String,
-    /// `open-loop` or `closed-loop`.
+    /// `open-loop`, `twin` or `closed-loop`.
     pub mode: String,
-    /// `push` or `pick-and-place`.
+    /// Name of the built-in task, such as `shared-push`.
     pub task: String,
     /// Number of the trial. Seed and number determine the starts and goals, for every policy and mode.
     pub trial: u64,
@@ -34,9 +34,9 @@ pub struct TrialRow {
     pub detail: Option<String>,
     /// Final distance of each object from its goal, metres.
     pub goal_distances_m: Vec<f64>,
-    /// Distance of each object from its goal at the end of the rehearsal, metres; blind modes only.
+    /// Distance of each object from its goal at the end of the rehearsal, metres; modes without feedback only.
     pub rehearsed_m: Option<Vec<f64>>,
-    /// Duration of the arms' motion, seconds.
+    /// Duration of the trial, seconds of simulated time.
     pub duration_s: f64,
     /// Number of steps of the policy.
     pub n_steps: u64,
@@ -87,16 +87,18 @@ pub struct ToolPathPoint {
 pub struct TrialsLog {
     path: PathBuf,
     file: File,
+    is_empty: bool,
 }
 
 impl TrialsLog {
-    /// Creates `path`, or truncates it.
+    /// Creates `path`. The first [`append`](Self::append) replaces the trials that it contains, if any.
     ///
     /// # Errors
     /// If the file cannot be written.
     pub fn create(path: &Path) -> Result<Self, Error> {
-        let file = File::create(path).map_err(Error::io("create", path))?;
-        Ok(Self { path: path.to_owned(), file })
+        let file = File::options().write(true).create(true).truncate(false).open(path);
+        let file = file.map_err(Error::io("create", path))?;
+        Ok(Self { path: path.to_owned(), file, is_empty: true })
     }
 
     /// Appends a trial.
@@ -108,6 +110,9 @@ impl TrialsLog {
         let mut line =
             serde_json::to_vec(row).map_err(std::io::Error::other).map_err(write_error)?;
         line.push(b'\n');
+        if std::mem::take(&mut self.is_empty) {
+            self.file.set_len(0).map_err(write_error)?;
+        }
         self.file.write_all(&line).map_err(write_error)
     }
 }
