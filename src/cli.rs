@@ -34,7 +34,9 @@ pub(crate) use service::{
     ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, MetricsArgs,
     RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
-pub(crate) use task::{TaskName, WorldName, check_layout, check_task, chosen_task, task_flags};
+pub(crate) use task::{
+    TaskName, WorldName, check_layout, check_n_arms, check_task, chosen_task, task_flags,
+};
 pub(crate) use train::{DashboardArgs, RecipeName, SweepArgs, TrainArgs};
 pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process_group};
 use tandem_worker::{EnvironmentServer, ServerAddress, ServerNotStarted};
-use tokio::io::{AsyncBufReadExt as _, BufReader, Lines};
+use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::Mutex;
 
@@ -73,8 +73,8 @@ impl CommandServer {
         let mut guard = spawned.map_err(|error| failed(format!("cannot be started: {error}")))?;
         let output = guard.stdout.take();
         let output = output.ok_or_else(|| failed("has no standard output".to_owned()))?;
-        let mut lines = BufReader::new(output).lines();
-        let address = tokio::time::timeout(self.start_timeout, read_address(&mut lines)).await;
+        let mut output = BufReader::new(output);
+        let address = tokio::time::timeout(self.start_timeout, read_address(&mut output)).await;
         let address = match address {
             Ok(Some(address)) => address,
             Ok(None) => {
@@ -92,7 +92,7 @@ impl CommandServer {
             }
         };
         tracing::info!(address, "environment command started");
-        tokio::spawn(log_lines(lines));
+        tokio::spawn(log_lines(output));
         Ok(ServerProcess { guard, address })
     }
 }
@@ -141,8 +141,8 @@ async fn wait(guard: &mut Child) -> String {
 }
 
 /// Returns the address in the first line of the form `listening on ADDR`; `None` if the output ends without one.
-async fn read_address(lines: &mut Lines<BufReader<ChildStdout>>) -> Option<String> {
-    while let Ok(Some(line)) = lines.next_line().await {
+async fn read_address(output: &mut BufReader<ChildStdout>) -> Option<String> {
+    while let Some(line) = next_line(output).await {
         match line.trim().strip_prefix(LISTENING) {
             Some(address) => return Some(address.to_owned()),
             None => log_line(&line),
@@ -152,9 +152,18 @@ async fn read_address(lines: &mut Lines<BufReader<ChildStdout>>) -> Option<Strin
 }
 
 /// Logs what the server prints, so that it never waits for a reader.
-async fn log_lines(mut lines: Lines<BufReader<ChildStdout>>) {
-    while let Ok(Some(line)) = lines.next_line().await {
+async fn log_lines(mut output: BufReader<ChildStdout>) {
+    while let Some(line) = next_line(&mut output).await {
         log_line(&line);
+    }
+}
+
+/// Returns the next line, whose bytes need not be UTF-8; `None` if the output has ended.
+async fn next_line(output: &mut BufReader<ChildStdout>) -> Option<String> {
+    let mut line = Vec::new();
+    match output.read_until(b'\n', &mut line).await {
+        Ok(0) | Err(_) => None,
+        Ok(_) => Some(String::from_utf8_lossy(&line).trim_end().to_owned()),
     }
 }
 

@@ -14,7 +14,7 @@ use tandem_core::{
 use tandem_picture::FilmEpisode;
 use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
 
-use crate::cli::{EvalArgs, OutcomeName, check_layout, check_task, chosen_task};
+use crate::cli::{EvalArgs, OutcomeName, check_layout, check_n_arms, check_task, chosen_task};
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -216,7 +216,10 @@ fn check_required(args: &EvalArgs, task: &TaskSpec, part: Part) -> Result<(), Fa
     match task.as_built_in() {
         Some(layout) if part == Part::AllArms => check_layout(layout, named, args.arms),
         Some(layout) => check_task(layout.task, args.task, args.world),
-        None if named == (None, None) => Ok(()),
+        None if named == (None, None) => match args.arms {
+            Some(n_arms) if part == Part::AllArms => check_n_arms(task.n_arms(), n_arms),
+            _ => Ok(()),
+        },
         None => Err(Failed::usage(format!(
             "the policy is for {}, which is no task of the simulator: leave out --task and --world",
             task.name()

@@ -21,6 +21,9 @@ use crate::{clock, output};
 
 pub(crate) use served::{Part, measure_served};
 
+/// Largest number of arms in the simulator.
+const MAX_ARMS: usize = 2;
+
 /// The policy that acts in an evaluation.
 #[derive(Debug, Clone)]
 pub(crate) enum EvaluatedPolicy {
@@ -53,11 +56,14 @@ impl EvaluatedPolicy {
                 policy.layout.n_arms()
             )));
         }
-        if !(1..=2).contains(&n_arms) {
+        if !(1..=MAX_ARMS).contains(&n_arms) {
             return Err(Failed::usage(format!("--arms {n_arms}: expected 1 or 2")));
         }
         let own = built_in(&policy).task;
         let task = task.filter(|task| task.of_one_arm() == own).unwrap_or(own);
+        if n_arms < task.min_arms() {
+            return Err(Failed::usage(format!("--arms {n_arms}: {task} takes two arms")));
+        }
         Ok(Self::Composed(policy, Layout::new(task, n_arms)))
     }
 
@@ -114,10 +120,17 @@ fn built_in(policy: &Policy) -> Layout {
     policy.layout.as_built_in().expect("the constructors refuse policies of other tasks")
 }
 
-/// Refuses a policy of a task that the simulator does not have.
+/// Refuses a policy of a task, or of a number of arms, that the simulator does not have.
 fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
     match policy.layout.as_built_in() {
-        Some(_) => Ok(policy),
+        Some(Layout { task, n_arms }) if (task.min_arms()..=MAX_ARMS).contains(&n_arms) => {
+            Ok(policy)
+        }
+        Some(Layout { task, n_arms }) => Err(Failed::usage(format!(
+            "{} drives {}, with which the simulator has no {task}",
+            path.display(),
+            counted(n_arms, "arm")
+        ))),
         None => Err(Failed::usage(format!(
             "{} is for task {:?}, which the simulator does not have: evaluate it with `tandem eval --env ADDR` or \
              `--env-command CMD`",

@@ -47,6 +47,7 @@ mod scene;
 mod served_task;
 mod service;
 mod settings_page;
+mod shell;
 mod signals;
 mod status;
 mod sweep;

@@ -16,7 +16,7 @@ use tandem_worker::record::{RecordError, world_of};
 use tandem_worker::replay::{replay_log, replay_log_on};
 
 use crate::cli::ReplayArgs;
-use crate::environment_server::EnvironmentSource;
+use crate::environment_server::{EnvironmentSource, names_server};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::film::PlannedFilm;
 use crate::service::worker_failed;
@@ -47,6 +47,11 @@ pub(crate) fn replay(args: &ReplayArgs) -> Result<(), Failed> {
     let planned = PlannedFilm::of(&args.film)?;
     let files = find_logs(&args.files)?;
     if let Some(address) = args.live.live {
+        if planned.is_some() || args.json || names_server(&args.environment) {
+            return Err(Failed::usage(
+                "--live only shows the episodes: leave out --film, --json, --env and --env-command",
+            ));
+        }
         return live::serve(address, &files);
     }
     if let Some(film) = planned {

@@ -68,7 +68,7 @@ pub(crate) fn scene(args: &SceneArgs) -> Result<(), Failed> {
 
 fn policy(args: &SceneArgs) -> Result<Option<EvaluatedPolicy>, Failed> {
     Ok(match (&args.policy, &args.composed_teachers) {
-        (Some(path), _) => Some(EvaluatedPolicy::Policy(policy_file::load(path)?)),
+        (Some(path), _) => Some(EvaluatedPolicy::new(policy_file::load(path)?, path)?),
         (None, Some(path)) => {
             let teacher = policy_file::load(path)?;
             let task = chosen_task(args.task, args.world)?;

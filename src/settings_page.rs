@@ -125,7 +125,8 @@ struct Values {
 }
 
 /// For each kind of run, the kinds whose values it need not repeat.
-const GENERALIZED_BY: [&[usize]; 8] = [&[], &[], &[], &[1, 2], &[], &[1, 4], &[2, 4], &[3, 5, 6]];
+const GENERALIZED_BY: [&[usize]; 9] =
+    [&[], &[], &[], &[1, 2], &[], &[1, 4], &[2, 4], &[3, 5, 6], &[]];
 
 impl Values {
     fn of_recipes() -> anyhow::Result<Self> {
@@ -138,6 +139,7 @@ impl Values {
             ("in the classic world with one arm", Task::Push, 1),
             ("in classic pick-and-place", Task::PickAndPlace, 2),
             ("in classic pick-and-place with one arm", Task::PickAndPlace, 1),
+            ("in carry-bar", Task::CarryBar, 2),
         ];
         let of_recipe = |recipe| -> anyhow::Result<Vec<(&'static str, Table)>> {
             let values = |(kind, task, n_arms): (&'static str, Task, usize)| {

@@ -26,6 +26,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::cli::{EnvironmentArgs, SweepArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::shell::shell_word;
 use crate::{dashboard, output, runtime, signals};
 use board::Board;
 use display::Display;
@@ -394,7 +395,7 @@ fn print_resume_command(args: &SweepArgs, out: &Path) {
     output::message("interrupted; the state is saved. Resume with:");
     output::message(format_args!(
         "  tandem sweep {} --out {}{options}",
-        args.file.display(),
-        out.display()
+        shell_word(&args.file),
+        shell_word(out)
     ));
 }

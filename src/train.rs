@@ -26,6 +26,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::live::LiveRun;
 use crate::progress_json::progress_json;
 use crate::run_display::Display;
+use crate::shell::shell_word;
 use crate::{
     clock, environment_server, metrics, output, runtime, served_task, settings_page, signals,
 };
@@ -147,7 +148,7 @@ async fn start(
 
 /// Describes how to resume the run, if that can help, and which log to read.
 fn failure_context(plan: &Plan, exit: Exit) -> String {
-    let (log, out) = (plan.log_path(), plan.out.display());
+    let (log, out) = (plan.log_path(), shell_word(&plan.out));
     let log = log.display();
     match exit {
         Exit::TryAgain => {

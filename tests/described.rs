@@ -253,6 +253,10 @@ fn an_evaluation_on_a_server_gives_the_results_of_the_run() {
     let refused = eval(&["--composed-teachers", text(&teacher), "--env", &two.address]);
     check_refused(&refused, 64, difference);
     check_refused(&eval(&["--policy", text(&student)]), 64, "tandem eval --env ADDR");
+    let refused = run(&["scene", "--policy", text(&student)]);
+    check_refused(&refused, 64, "which the simulator does not have");
+    let refused = eval(&["--policy", text(&student), "--env", &two.address, "--arms", "1"]);
+    check_refused(&refused, 64, "the policy is for 2 arms, not for 1 arm");
     check_refused(
         &eval(&["--policy", text(&student), "--env", &two.address, "--record", "x.mcap"]),
         64,

@@ -80,7 +80,7 @@ pub enum CalibrationError {
     },
     /// A motion was not started.
     #[error("{0}")]
-    Start(StartError),
+    Start(#[source] StartError),
     /// The arms were stopped.
     #[error("the arms were stopped: {0}")]
     Stopped(Stop),

@@ -1,7 +1,7 @@
 //! The environments of one stream.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rayon::iter::ParallelIterator as _;
 use rayon::iter::{IndexedParallelIterator as _, IntoParallelRefMutIterator as _};
@@ -34,13 +34,18 @@ impl Prototypes {
     }
 
     fn get(&self, substeps: u32) -> Result<Env, SimError> {
-        let mut by_substeps = self.by_substeps.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(env) = by_substeps.get(&substeps) {
-            return Ok(env.clone());
+        let known = self.by_substeps().get(&substeps).cloned();
+        if let Some(env) = known {
+            return Ok(env);
         }
+        // Other streams need not wait until it is built.
         let env = Env::new(self.layout, &WorldConfig { substeps, ..WorldConfig::default() })?;
-        by_substeps.insert(substeps, env.clone());
+        self.by_substeps().insert(substeps, env.clone());
         Ok(env)
+    }
+
+    fn by_substeps(&self) -> MutexGuard<'_, BTreeMap<u32, Env>> {
+        self.by_substeps.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

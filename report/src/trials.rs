@@ -33,11 +33,11 @@ pub const OTHER_CAUSES: &str = "other";
 /// Trials of one policy in one task and mode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialGroup {
-    /// `push` or `pick-and-place`.
+    /// Name of the built-in task, such as `shared-push`.
     pub task: String,
     /// Name of the policy.
     pub policy: String,
-    /// `open-loop` or `closed-loop`.
+    /// `open-loop`, `twin` or `closed-loop`.
     pub mode: String,
     /// Trials, sorted by seed and number.
     pub rows: Vec<TrialRow>,

@@ -8,7 +8,7 @@ use tandem_core::{Task, World, WorldSettings};
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {
     /// Resolution of the physics, in [10, 80]: physics steps per control step in the classic world, and a quarter of
-    /// their number in the shared world. 20 gives steps of 0.002 s, as in the paper, and of 0.003125 s; 10 is twice as
+    /// their number in the other ones. 20 gives steps of 0.002 s, as in the paper, and of 0.003125 s; 10 is twice as
     /// fast.
     pub substeps: u32,
     /// Iterations of the contact solver per physics step, in [1, 16]; twice as many in the slow world.

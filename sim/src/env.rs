@@ -153,7 +153,7 @@ impl Env {
     /// during it.
     ///
     /// `action` has shape `[n_action]`, in arm frames, and is clamped to [−1, 1]. Each arm's part is a displacement of
-    /// the end effector along x, y and z in units of 5 cm and, in pick and place, the gripper's input: positive values
+    /// the end effector along x, y and z in units of 5 cm and, in tasks of grasping, the gripper's input: positive values
     /// open the gripper, −1 closes it and holds.
     ///
     /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap
@@ -187,7 +187,7 @@ impl Env {
 
     /// Returns the number of physics steps of the last control step in which link avoidance changed the velocity of an
     /// arm. There are [`WorldConfig::substeps`] of them in a control step of the classic world and 4 times as many in
-    /// the shared world.
+    /// the other ones.
     #[must_use]
     pub fn n_avoiding_substeps(&self) -> u32 {
         self.world.n_avoiding_substeps()

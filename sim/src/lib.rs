@@ -1,6 +1,6 @@
-//! The simulated environments: push and pick and place, with one arm or two.
+//! The simulated environments: push and pick and place with one arm or two, and two arms that carry a bar.
 //!
-//! An [`Env`] starts episodes, writes observations and executes actions. All four environments share one
+//! An [`Env`] starts episodes, writes observations and executes actions. All environments share one
 //! implementation; a [`Layout`](tandem_core::Layout) selects the task and the number of arms. The crate knows nothing
 //! of policies, advice or rewards: `tandem_policy` chooses actions, and [`tandem_core::reward`] computes rewards from
 //! observations.
@@ -43,7 +43,7 @@
 //! |---|---|---|
 //! | observation | 28 | hand, object, fingers and their velocities; [`Env::observe`] lists them |
 //! | goal | 3 | desired position of the object, metres |
-//! | action | 3 or 4 | displacement in units of 5 cm, in pick and place also the gripper; see [`Env::step`] |
+//! | action | 3 or 4 | displacement in units of 5 cm, in tasks of grasping also the gripper; see [`Env::step`] |
 //!
 //! An action of 1 along x moves the end effector away from the arm's base, for either arm:
 //!

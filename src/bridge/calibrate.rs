@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::anyhow;
 use serde_json::json;
 use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibrate as measure};
 use tandem_bridge::cell_file::{ArmTiming, with_timings};
@@ -89,7 +88,7 @@ fn measure_arms(
             CalibrationError::Setting(_) => Exit::Data,
             _ => Exit::TryAgain,
         };
-        Failed::new(exit, anyhow!("the cell file is unchanged: {error}"))
+        Failed::new(exit, anyhow::Error::new(error).context("the cell file is unchanged"))
     })
 }
 

@@ -147,7 +147,7 @@ fn move_arms(
         if exit == Exit::Interrupted {
             output::message("tandem: interrupted: the arms are stopped");
         }
-        Failed::new(exit, anyhow!("the arms are not at their start: {error}"))
+        Failed::new(exit, anyhow::Error::new(error).context("the arms are not at their start"))
     })
 }
 

@@ -27,9 +27,13 @@ pub(crate) struct BenchArgs {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BenchName {
+    /// Environment steps per second on one core.
     Sim,
+    /// Time of one decision of the student.
     Inference,
+    /// Updates per second, by the number of threads.
     Update,
+    /// Time of sampling a batch with hindsight.
     Replay,
     /// The teacher service, compared with an echo service of the same messages.
     Teacher,

@@ -21,7 +21,7 @@ pub(crate) struct SceneArgs {
     /// Task [default: the policy's, or push].
     #[arg(long, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
-    /// World of the task [default: the policy's, or classic].
+    /// World of the task [default: the policy's, or shared].
     #[arg(long, value_enum)]
     pub(crate) world: Option<WorldName>,
     /// Number of arms [default: the policy's; 2 otherwise].

@@ -123,8 +123,8 @@ pub(crate) struct LearnerArgs {
     /// Run directory.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.*, evaluation.recorded_episodes and
-    /// evaluation.test_episodes can differ from those of the run.
+    /// Resumes from the newest checkpoint. Only the settings stop.*, checkpoint.*, evaluation.early_points,
+    /// evaluation.recorded_episodes and evaluation.test_episodes can differ from those of the run.
     #[arg(long)]
     pub(crate) resume: bool,
     /// Writes the resolved settings to run.toml in the run directory.

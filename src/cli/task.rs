@@ -104,13 +104,18 @@ pub(crate) fn check_layout(
     n_arms: Option<usize>,
 ) -> Result<(), Failed> {
     check_task(of_policy.task, task, world)?;
-    match n_arms {
-        Some(n_arms) if n_arms != of_policy.n_arms => Err(Failed::usage(format!(
+    n_arms.map_or(Ok(()), |n_arms| check_n_arms(of_policy.n_arms, n_arms))
+}
+
+/// Rejects a number of arms other than the policy's.
+pub(crate) fn check_n_arms(of_policy: usize, n_arms: usize) -> Result<(), Failed> {
+    match of_policy == n_arms {
+        true => Ok(()),
+        false => Err(Failed::usage(format!(
             "the policy is for {}, not for {}",
-            counted(of_policy.n_arms, "arm"),
+            counted(of_policy, "arm"),
             counted(n_arms, "arm")
         ))),
-        _ => Ok(()),
     }
 }
 

@@ -17,7 +17,7 @@ Examples:
       --composed-teachers policies/teacher-push.safetensors
   tandem bridge trial --task carry-bar --mode closed-loop \\
       --composed-teachers policies/teacher-pick-and-place-classic.safetensors
-  tandem report runs/trial-push")]
+  tandem report runs/trial-shared-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {
     /// Policy for both arms, reported under the name of its file or run directory; can be repeated.

@@ -15,6 +15,7 @@ use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
 use crate::service::worker_failed;
+use crate::shell::shell_word;
 use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
@@ -89,10 +90,10 @@ impl Plan {
 
     /// Rejects a new run in a directory that contains a run, and a resume in one that does not.
     fn check_directory(&self) -> Result<(), Failed> {
-        let shown = self.out.display();
+        let (shown, word) = (self.out.display(), shell_word(&self.out));
         match (self.run_file().exists(), self.resume) {
             (true, false) => Err(Failed::usage(format!(
-                "{shown} holds a run already: resume it with `tandem train --resume --out {shown}`, or choose another --out"
+                "{shown} holds a run already: resume it with `tandem train --resume --out {word}`, or choose another --out"
             ))),
             (false, true) => Err(run_directory::no_run(&format!("{shown} holds no run to resume"))),
             _ => Ok(()),
@@ -303,10 +304,10 @@ fn account_name(out: &Path) -> Option<String> {
 
 /// Reports that the run has another directory than usual, because there is a run in that one.
 fn remark_on(base: &Path, out: &Path) {
-    let (state, base) = (run_directory::state(base), base.display());
+    let (state, word, base) = (run_directory::state(base), shell_word(base), base.display());
     output::message(wrapped(
         &format!(
-            "{base} exists ({state}; `tandem train --resume --out {base}` resumes it): this run is {}",
+            "{base} exists ({state}; `tandem train --resume --out {word}` resumes it): this run is {}",
             out.display()
         ),
         "  ",

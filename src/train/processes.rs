@@ -1,7 +1,7 @@
 //! The processes of a run: started in order, restarted when they die, ended together.
 
 use std::ffi::OsString;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
@@ -28,6 +28,8 @@ pub(crate) struct RunProcesses {
     /// Addresses of the services, which stay the same after a restart.
     teacher_address: Option<String>,
     learner_address: String,
+    /// IP address that the dashboard listens on, if there is to be one.
+    dashboard_ip: Option<IpAddr>,
     /// Address of the dashboard, if there is one.
     dashboard: Option<SocketAddr>,
     peak: PeakMemory,
@@ -91,6 +93,7 @@ impl RunProcesses {
             processes: Vec::new(),
             teacher_address: None,
             learner_address: String::new(),
+            dashboard_ip: plan.dashboard.map(|address| address.ip()),
             dashboard: None,
             peak: PeakMemory::default(),
         })
@@ -277,8 +280,9 @@ impl RunProcesses {
             return;
         }
         display.print(line);
-        let host = line.strip_prefix("dashboard on http://").map(|it| it.trim_end_matches('/'));
-        self.dashboard = host.and_then(|host| host.replace("localhost", "0.0.0.0").parse().ok());
+        let port = line.trim_end_matches('/').rsplit_once(':');
+        let port: Option<u16> = port.and_then(|(_, port)| port.parse().ok());
+        self.dashboard = self.dashboard_ip.zip(port).map(SocketAddr::from);
     }
 
     /// Returns the address of the dashboard as a link, if there is one.

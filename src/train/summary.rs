@@ -10,13 +10,14 @@ use tandem_system::atomic_file;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
-use crate::cli::TrainArgs;
+use crate::cli::{TrainArgs, task_flags};
 use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{advice_text, clock_text, grouped};
 use crate::run_pages::RunPages;
+use crate::shell::shell_word;
 use crate::{film, output, policy_file, run_directory};
 
 /// File in the run directory.
@@ -147,7 +148,8 @@ fn next_commands(plan: &Plan) -> Vec<String> {
         commands.push(format!("tandem eval --policy {policy}{baselines}"));
     }
     if plan.config.arms == 1 && is_simulated {
-        commands.push(format!("tandem train --teacher {policy}"));
+        let task = plan.config.task.parse().map_or_else(|_unknown| String::new(), task_flags);
+        commands.push(format!("tandem train {task} --teacher {policy}"));
     }
     commands.extend(newest_log(&plan.out).map(|log| format!("tandem replay {}", shell_word(&log))));
     commands.push(format!("tandem policy export {policy} --onnx actor.onnx"));
@@ -174,16 +176,6 @@ fn newest_log(out: &Path) -> Option<PathBuf> {
     let entries = std::fs::read_dir(out.join("mcap")).ok()?;
     let logs = entries.filter_map(|entry| Some(entry.ok()?.path()));
     logs.filter(|path| path.to_string_lossy().ends_with("-000.mcap")).max()
-}
-
-/// Returns a path as a word of a shell's command line.
-pub(super) fn shell_word(path: &Path) -> String {
-    let text = path.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "/._-+:,=@%".contains(c);
-    match !text.is_empty() && text.chars().all(is_plain) {
-        true => text,
-        false => format!("'{}'", text.replace('\'', r"'\''")),
-    }
 }
 
 /// Prints the command that resumes an interrupted run.

@@ -214,7 +214,9 @@ impl TeacherFile {
             return server.write(&self.copy_path(directory));
         }
         for (from, to) in copies {
-            let written = std::fs::read(from).and_then(|bytes| atomic_file::replace(&to, &bytes));
+            let bytes = std::fs::read(from);
+            let bytes = bytes.or_exit(Exit::Data, || format!("cannot read {}", from.display()))?;
+            let written = atomic_file::replace(&to, &bytes);
             written.or_cannot_write(|| format!("cannot write {}", to.display()))?;
         }
         Ok(())

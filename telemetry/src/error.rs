@@ -34,6 +34,12 @@ pub enum Error {
         /// The cause.
         source: mcap::McapError,
     },
+    /// The file does not start like an MCAP file.
+    #[error("{path:?} is not an MCAP file: name a log, FILE.mcap or FILE.mcap.part")]
+    NotMcap {
+        /// Path of the file.
+        path: PathBuf,
+    },
     /// The file is an MCAP file, but not the log of an episode.
     #[error("{path:?} is not the log of an episode: {problem}")]
     NotAnEpisode {

@@ -33,7 +33,7 @@ pub struct RecoveredCounts {
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
     let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
-        return Err(Error::ReadLog { path: source.to_owned(), source: McapError::BadMagic });
+        return Err(Error::NotMcap { path: source.to_owned() });
     }
     atomic_file::replace_with(destination, |file| copy_readable(&bytes, file))
         .map_err(Error::write_log(destination))

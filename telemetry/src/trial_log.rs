@@ -27,7 +27,7 @@ pub struct TrialMetadata {
     pub policy: String,
     /// Task and number of arms.
     pub layout: Layout,
-    /// `open-loop` or `closed-loop`.
+    /// `open-loop`, `twin` or `closed-loop`.
     pub mode: String,
     /// Number of the trial.
     pub trial: u64,
@@ -35,7 +35,7 @@ pub struct TrialMetadata {
     pub seed: u64,
     /// Digest of the policy file.
     pub policy_digest: String,
-    /// Name of the driver, such as `simulated`.
+    /// Name of the driver, such as `sim`.
     pub driver: String,
     /// Share of full speed, in (0, 1].
     pub speed: f64,

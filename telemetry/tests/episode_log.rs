@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use tandem_core::TaskSpec;
 use tandem_telemetry::{
     EpisodeLog, EpisodeMetadata, EpisodeRecorder, Error, LoggedTransition, read_episode, recover,
 };
@@ -106,6 +107,53 @@ fn an_episode_of_a_described_task_is_read_back_with_its_description() {
     assert_eq!(record(3), expected(&of_points));
     assert_eq!(record(2), expected(&of_points));
     assert_eq!(record(1), expected(&of_numbers), "a goal of one number is no point");
+}
+
+/// The part of the message `/outcome` that a viewer shows.
+#[derive(Clone, PartialEq, prost::Message)]
+struct ShownOutcome {
+    #[prost(bool, tag = "2")]
+    success: bool,
+    #[prost(bool, repeated, tag = "3")]
+    success_per_arm: Vec<bool>,
+}
+
+/// Returns the outcome of an episode in which the arms are at their goals in the last observations, each in a number of
+/// its own, and succeed after three.
+fn outcome(n_at_goal: [usize; 2]) -> (bool, Vec<bool>) {
+    let mut description = synthetic::described(1).description().clone();
+    description.manipulation.success_steps = 3;
+    let task = TaskSpec::new(description).unwrap();
+    let n_steps = task.episode_steps();
+    let observation = |step: usize| {
+        let mut observation = vec![0.0; task.n_observation()];
+        for (arm_idx, n_at_goal) in n_at_goal.into_iter().enumerate() {
+            observation[5 * arm_idx] = if step + n_at_goal > n_steps { 0.5 } else { 0.0 };
+        }
+        observation
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let metadata = EpisodeMetadata { layout: task.clone(), ..synthetic::metadata() };
+    let mut recorder =
+        EpisodeRecorder::create(&dir.path().join("outcome.mcap"), &metadata).unwrap();
+    for (step, mut transition) in (0..).zip(synthetic::transitions_of(&task)) {
+        transition.observation = observation(step as usize);
+        transition.goal = vec![0.5; task.n_goal()];
+        recorder.record_step(None, &synthetic::record(step, &transition)).unwrap();
+    }
+    recorder.record_outcome(None, &observation(n_steps)).unwrap();
+    let bytes = std::fs::read(recorder.finish().unwrap()).unwrap();
+    let mut messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    let message = messages.find(|message| message.channel.topic == "/outcome").unwrap();
+    let outcome = <ShownOutcome as prost::Message>::decode(&*message.data).unwrap();
+    (outcome.success, outcome.success_per_arm)
+}
+
+#[test]
+fn an_outcome_is_a_success_after_as_many_steps_as_the_task_asks_for() {
+    assert_eq!(outcome([3, 3]), (true, vec![true, true]));
+    assert_eq!(outcome([3, 2]), (false, vec![true, false]), "the goal for two steps of three");
+    assert_eq!(outcome([12, 0]), (false, vec![true, false]));
 }
 
 #[test]
@@ -227,7 +275,7 @@ fn garbage_is_not_recovered_as_an_empty_file() {
     let destination = dir.path().join("recovered.mcap");
     assert!(matches!(
         recover(&dir.path().join("garbage"), &destination),
-        Err(Error::ReadLog { .. })
+        Err(Error::NotMcap { .. })
     ));
     assert!(!destination.exists());
 }

@@ -117,7 +117,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 88] = [
+const CASES: [(&str, i32, &str); 90] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -162,6 +162,11 @@ const CASES: [(&str, i32, &str); 88] = [
     ("eval --policy %teacher-push --robustness --baselines", 64, "--baselines"),
     ("eval --policy %teacher-push --robustness --film @empty/x.gif", 64, "--film"),
     ("eval --composed-teachers %student-push", 64, "a teacher drives one"),
+    (
+        "eval --composed-teachers %teacher-pick-and-place-classic --task carry-bar --arms 1",
+        64,
+        "--arms 1: carry-bar takes two arms",
+    ),
     ("teacher", 64, "--policy"),
     ("teacher --policy @missing", 65, "missing"),
     ("teacher --policy @torn", 65, "torn"),
@@ -181,12 +186,13 @@ const CASES: [(&str, i32, &str); 88] = [
     ("policy show @folder --json", 65, "folder"),
     ("mcap recover @missing", 65, "missing"),
     ("mcap recover @folder --to @mended", 65, "folder"),
-    ("mcap recover @garbage --to @mended", 65, "garbage"),
+    ("mcap recover @garbage --to @mended", 65, "garbage\" is not an MCAP file"),
     ("mcap recover @garbage --to @empty", 64, "exists"),
     ("replay", 64, "FILE"),
     ("replay @missing", 65, "missing"),
     ("replay @folder", 65, "no *.mcap"),
     ("replay @empty --verify", 65, "empty"),
+    ("replay @garbage --live --json", 64, "leave out --film, --json"),
     ("picture --policy %teacher-push --out @empty/x.png", 64, "x.png"),
     ("picture --policy %teacher-push --out arms.svg", 64, "must end in .png"),
     ("eval --policy %teacher-push --film arms.mp4", 64, "must end in .gif"),

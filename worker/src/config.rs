@@ -63,7 +63,7 @@ pub struct EnvironmentConfig {
 impl EnvironmentConfig {
     /// The default deadline of a reply.
     pub const REPLY_TIMEOUT: Duration = Duration::from_secs(60);
-    /// The default number of attempts: with the default pauses between them, about 30 seconds.
+    /// The default number of attempts: the pauses between them take about 23 seconds together.
     pub const MAX_ATTEMPTS: u32 = 10;
     /// The pauses between attempts.
     pub(crate) const BACKOFF: Backoff =

@@ -12,7 +12,7 @@ use crate::layout::{
 };
 
 /// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
-/// they cannot touch. Hands move by at most 5 cm in a step of either world, and reach 3.5 cm ahead of their position.
+/// they cannot touch. Hands move by at most 5 cm in a step of any world, and reach 3.5 cm ahead of their position.
 const RECOMBINATION_GAP_M: f32 = 0.10;
 /// The same in the plane, in the shared world: a hand is at most 0.12 m wide and moves up to 0.05 m per step.
 const SHARED_RECOMBINATION_GAP_M: f32 = 0.16;

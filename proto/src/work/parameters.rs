@@ -93,12 +93,13 @@ fn decode_gate(
         return without_gate(parameters).map(|()| None);
     }
     let count = |field, count, most| count_within(field, count, &(1..=most)).map(to_usize);
-    let n_critics = count("n_critics", parameters.n_critics, MAX_CRITICS)?;
+    let n_critics = count_within("n_critics", parameters.n_critics, &(2..=MAX_CRITICS))?;
     let n_hidden = count("n_critic_hidden", parameters.n_critic_hidden, MAX_HIDDEN)?;
     let n_layers = count("n_critic_layers", parameters.n_critic_layers, MAX_HIDDEN_LAYERS)?;
     let n_arms = u32::try_from(layout.n_arms()).expect("a layout has few arms");
     let n_heads = count("n_critic_heads", parameters.n_critic_heads, n_arms)?;
     let n_input = layout.n_observation() + layout.n_goal() + layout.n_action();
+    let n_critics = to_usize(n_critics);
     let n_parameters = n_critics * n_mlp_parameters([n_input, n_heads], n_hidden, n_layers);
     Ok(Some(PublishedGate {
         n_critics,
@@ -191,7 +192,8 @@ mod tests {
             spoil(&mut spoilt);
             assert_eq!(decode_actor(&spoilt, LAYOUT).unwrap_err().to_string(), expected);
         };
-        check(|m| m.n_critics = 65, "n_critics: expected 1 to 64, got 65");
+        check(|m| m.n_critics = 65, "n_critics: expected 2 to 64, got 65");
+        check(|m| m.n_critics = 1, "n_critics: expected 2 to 64, got 1");
         check(|m| m.n_critic_heads = 3, "n_critic_heads: expected 1 to 2, got 3");
         check(|m| m.n_critics = 0, "n_critic_hidden: expected no value without critics, got one");
         let rest = |m: &mut pb::Parameters| {

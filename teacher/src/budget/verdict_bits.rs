@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::BudgetHalf;
 
-/// Steps whose verdicts share one [`VerdictBits`]: more than an episode of a run has.
+/// Steps whose verdicts share one [`VerdictBits`]: more than an episode of a built-in task has.
 const STEPS_PER_WORD: u32 = 64;
 
 /// The verdicts on 64 consecutive steps. The first step is the lowest bit.

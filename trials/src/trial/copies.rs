@@ -1,4 +1,4 @@
-//! Copies of the pair, on which blind motions are rehearsed and tried.
+//! Copies of the pair, on which motions without feedback are rehearsed and tried.
 //!
 //! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. A blind
 //! motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their

@@ -40,7 +40,7 @@ impl Marker {
             Self::End => "tool, at the end",
             Self::ObjectStart => "object, at the start",
             Self::ObjectEnd => "object, at the end",
-            Self::Goal => "goal, 5 cm around it",
+            Self::Goal => "goal and its tolerance",
         }
         .to_owned()
     }
