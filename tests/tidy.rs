@@ -151,6 +151,14 @@ fn the_image_is_of_this_version_and_toolchain() {
     {
         assert!(context.lines().any(|line| line == format!("!{name}")), "no {name} in the context");
     }
+    // Cargo accepts a test whose file is not in the context only if the manifest names the file.
+    let of_crates = ALLOWED.map(|(name, _)| format!("{name}/Cargo.toml"));
+    for name in of_crates.into_iter().chain(["Cargo.toml".to_owned()]) {
+        for test in read(&name).split("\n[").filter_map(|table| table.strip_prefix("[test]]\n")) {
+            let has_path = test.lines().any(|line| line.starts_with("path = "));
+            assert!(has_path, "{name}: a [[test]] without a path: {test}");
+        }
+    }
 }
 
 /// Other versions of what computes could give other bits.
