@@ -2,7 +2,7 @@
 """Times other projects and Tandem in turn on one core: gymnasium-robotics' Fetch environments and PyTorch's DDPG update.
 
 Usage: python scripts/bench_peers.py [--tandem target/release/tandem] [--rounds 3]
-Needs: pip install mujoco==3.10.0 gymnasium-robotics==1.4.2 (newer mujoco breaks that package), and torch for the update.
+Needs: pip install './python[fetch]', and torch for the update.
 Prints one JSON object a line (name, value, unit), then the ratios. A peer that is not installed is left out, and said so.
 """
 

@@ -127,7 +127,9 @@ def follow(run, process, before_s, ended):
             if new:
                 with open(file, "a", encoding="utf-8") as lines:
                     lines.writelines([header, *(f"{env_steps},{spent:.1f}\n" for env_steps in new)])
-        (run / "processor_s").write_text(f"{spent:.1f}\n", encoding="utf-8")
+        written = run / "processor_s.new"
+        written.write_text(f"{spent:.1f}\n", encoding="utf-8")
+        written.replace(run / "processor_s")
         if is_over:
             return
 
@@ -196,13 +198,13 @@ def run_tandem(piece, run, options):
     print(shlex.join(command), file=sys.stderr)
     # A process group of its own: Ctrl-C reaches this program only, which then asks Tandem to save and end.
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    while process.poll() is None and not run.exists():
-        time.sleep(0.1)
     ended = threading.Event()
     meter = threading.Thread(target=follow, args=(run, process, before_s, ended))
-    if run.exists():
-        meter.start()
     try:
+        while process.poll() is None and not run.exists():
+            time.sleep(0.1)
+        if run.exists():
+            meter.start()
         output, _ = process.communicate()
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
@@ -228,7 +230,15 @@ def run_sb3(piece, run, options):
         shutil.rmtree(run, ignore_errors=True)
         command += ["--algorithm", piece.kind, "--env", piece.env, "--seed", str(piece.seed)]
     print(shlex.join(command), file=sys.stderr)
-    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
+    # As in run_tandem. Saving a replay buffer takes seconds.
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    try:
+        process.wait()
+    except KeyboardInterrupt:
+        process.send_signal(signal.SIGINT)
+        process.wait()
+        raise
+    if process.returncode != 0:
         raise Wrong(f"{piece.name}: bench_sb3.py failed")
     state = json.loads((run / "state.json").read_text(encoding="utf-8"))
     limit_s = 60 * options.max_minutes

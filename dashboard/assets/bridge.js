@@ -19,6 +19,7 @@ async function stop() {
   const result = byId("stop-result");
   const button = byId("stop");
   button.classList.add("pressed");
+  result.className = "stop-result";
   setText(result, "Stopping …");
   try {
     const response = await fetch("/stop", {
@@ -27,8 +28,12 @@ async function stop() {
       signal: AbortSignal.timeout(STOP_TIMEOUT_MS),
     });
     if (response.status === 401) return location.reload();
-    const answer = await response.json().catch(() => ({}));
+    const answer = await response.json().catch((error) => {
+      if (error.name === "TimeoutError") throw error;
+      return {};
+    });
     if (!response.ok) throw new Error(answer.problem ?? `the bridge answers ${response.status}`);
+    if (typeof answer.stopped !== "string") throw new Error("the answer is not a bridge's");
     result.className = "stop-result confirmed";
     setText(result, `Stopped ${answer.stopped}`);
   } catch (error) {
@@ -195,10 +200,11 @@ async function showLog(version) {
   logVersion = version;
   try {
     const events = await fetchJson("/data/log");
+    if (logVersion !== version) return;
     byId("log").replaceChildren(...[...events].reverse().map((event) => el("li", {}, el("time", {}, time(event.unix_ms)),
       el("span", { class: `mark ${event.level}`, "aria-hidden": "true" }, MARKS[event.level]), el("span", {}, event.text))));
   } catch {
-    logVersion = former;
+    if (logVersion === version) logVersion = former;
   }
 }
 

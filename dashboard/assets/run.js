@@ -129,7 +129,7 @@ function showWorkers(s) {
     });
 }
 
-/** Returns a bar of two shares with a text that says the same. */
+/** Returns a bar of two shares, hidden from screen readers: a text beside it says the same. */
 function meter(first, second) {
   const bar = el("div", { class: "meter", "aria-hidden": "true" }, el("i", { class: "fill-first" }), el("i", { class: "fill-second" }));
   const total = first + second;

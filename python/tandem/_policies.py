@@ -243,11 +243,11 @@ def serve_policy(
       policy: a one-arm policy of `tandem.load_policy`, which needs no other argument; or a function of observations,
         shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in [-1, 1], shape
         `[m, n_action]`; all float32.
-      task: `push`, `pick-and-place` or a `tandem.Task` of one arm.
+      task: the name of a built-in task, such as `shared-push`, or a `tandem.Task` of one arm.
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
         without it, strategies that compare values are not available.
       name: the name of the policy in logs.
-      digest: identifies the policy, 1 to 128 letters and digits; by default a hash of its answers in 64 fixed states.
+      digest: identifies the policy, 1 to 128 letters, digits, `-`, `_`, `.` and `:`; by default a hash of its answers in 64 fixed states.
       batched: whether to evaluate all states of a request at once. By default m is 1, so an answer does not depend on
         the other states of a request, as the last bits of matrix products do.
       token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.

@@ -58,7 +58,8 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         n_arms: 1 or 2; 2 for `"carry-bar"`.
         world: `"shared"` (slow arms that share one area, control steps of 0.25 s), `"classic"` (fast arms whose areas
             lie next to each other, control steps of 0.04 s) or `"slow"` (the only world of `"carry-bar"`).
-        substeps: Physics steps per control step, 20 or 10.
+        substeps: Resolution of the physics, 20 or 10: physics steps per control step in the classic world, a quarter
+            of their number in the others.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.

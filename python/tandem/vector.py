@@ -37,8 +37,8 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
 
     Args:
         num_envs: Number of environments.
-        task: `"push"` or `"pick-and-place"`.
-        n_arms: 1 or 2.
+        task: As for `TandemEnv`.
+        n_arms: As for `TandemEnv`.
         world: As for `TandemEnv`.
         max_episode_steps: Steps after which an episode is truncated.
         autoreset_mode: When an environment whose episode is over starts the next one; Gymnasium's modes.
