@@ -342,6 +342,10 @@ class EnvironmentServer(Server):
         }
         with contextlib.closing(make(env_fn)) as env:
             self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
+        try:
+            self.task.to_message()
+        except (TypeError, ValueError) as error:
+            raise ServiceError(f"the task cannot be described: {error}") from error
         task = self.task
 
         def create() -> GymEnvironment:

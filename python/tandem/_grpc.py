@@ -6,6 +6,7 @@ import hmac
 import ipaddress
 import os
 import pathlib
+import ssl
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -79,6 +80,17 @@ def _read(path: Path) -> bytes:
         raise ServiceError(f"cannot read {os.fspath(path)!r}: {error.strerror}") from error
 
 
+def _check_certificate(certificate: Path, key: Path) -> None:
+    """Refuses a certificate or key that cannot be used, which gRPC would report as an address in use."""
+    for path in (certificate, key):
+        _read(path)
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except (OSError, ValueError) as error:
+        names = f"certificate {os.fspath(certificate)!r} with key {os.fspath(key)!r}"
+        raise ServiceError(f"cannot use {names}: {error}") from error
+
+
 class _RequireToken(grpc.ServerInterceptor):  # type: ignore[misc]
     """Refuses calls without the token, except health checks, before their requests are decoded."""
 
@@ -135,6 +147,7 @@ class Server:
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("grpc.health.v1.Health", health),))
         try:
             if tls_cert is not None and tls_key is not None:
+                _check_certificate(tls_cert, tls_key)
                 credentials = grpc.ssl_server_credentials([(_read(tls_key), _read(tls_cert))])
                 bound = server.add_secure_port(f"{host}:{port}", credentials)
             else:

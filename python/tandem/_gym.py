@@ -32,15 +32,17 @@ def _make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
         return env_fn()
     name, kwargs = (env_fn, {}) if isinstance(env_fn, str) else env_fn
     try:
+        try:
+            return gymnasium.make(name, **kwargs)
+        except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound):
+            for package in _PACKAGES:
+                with contextlib.suppress(ImportError):
+                    importlib.import_module(package)
         return gymnasium.make(name, **kwargs)
-    except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound):
-        for package in _PACKAGES:
-            with contextlib.suppress(ImportError):
-                importlib.import_module(package)
-    try:
-        return gymnasium.make(name, **kwargs)
-    except (gymnasium.error.Error, ImportError) as error:
+    except (gymnasium.error.UnregisteredEnv, ImportError) as error:
         raise ServiceError(f"no environment {name!r}: {error}; MODULE:ID imports a module first") from error
+    except (gymnasium.error.Error, TypeError, ValueError) as error:
+        raise ServiceError(f"cannot create environment {name!r}: {error}") from error
 
 
 class GymEnvironment:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
@@ -38,7 +39,7 @@ cannot be used.""",
     parser.add_argument(
         "--listen", metavar="HOST:PORT", help=f"address to listen on [{LISTEN_VARIABLE}, or a free port of 127.0.0.1]"
     )
-    parser.add_argument("--kwargs", type=json.loads, default={}, help="arguments of the environment, a JSON object")
+    parser.add_argument("--kwargs", type=_object, default={}, metavar="JSON", help="arguments of the environment, a JSON object")
     parser.add_argument("--n", type=int, default=64, help="largest number of environments of a stream [%(default)s]")
     parser.add_argument(
         "--workers", type=int, default=1, help="processes that step the environments of a stream [%(default)s]"
@@ -66,7 +67,7 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
         metavar="JSON",
         help="list with an object per arm: lists of indices observation, goal, action and, optionally, position, lateral and hand",
     )
-    group.add_argument("--achieved-goal", type=json.loads, metavar="JSON", help="indices in the observation [found]")
+    group.add_argument("--achieved-goal", type=_indices, metavar="JSON", help="indices in the observation [found]")
     group.add_argument(
         "--interchangeable-arms", action="store_true", default=None, help="exchanging arms is another valid transition"
     )
@@ -97,9 +98,29 @@ def _add_arms(group: argparse._ArgumentGroup) -> None:
     )
 
 
+def _object(text: str) -> dict[str, Any]:
+    with contextlib.suppress(ValueError):
+        given = json.loads(text)
+        if isinstance(given, dict):
+            return given
+    raise argparse.ArgumentTypeError(f"expected a JSON object, got {text!r}")
+
+
+def _indices(text: str) -> tuple[int, ...]:
+    with contextlib.suppress(ValueError):
+        return _checked_indices(json.loads(text))
+    raise argparse.ArgumentTypeError(f"expected a JSON list of indices, got {text!r}")
+
+
+def _checked_indices(given: object) -> tuple[int, ...]:
+    if isinstance(given, list) and all(type(index) is int and 0 <= index < 4096 for index in given):
+        return tuple(given)
+    raise ValueError(f"{given!r} is not a list of indices")
+
+
 def _arms(text: str) -> list[Arm]:
     try:
-        return [Arm(**{name: tuple(indices) for name, indices in arm.items()}) for arm in json.loads(text)]
+        return [Arm(**{name: _checked_indices(part) for name, part in arm.items()}) for arm in json.loads(text)]
     except (AttributeError, TypeError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"expected a list of objects with lists of indices: {error}") from None
 
@@ -135,9 +156,6 @@ def main() -> int:
     """Runs the command line, and returns the exit code."""
     arguments = vars(_parser().parse_args())
     env, kwargs = arguments.pop("env"), arguments.pop("kwargs")
-    if not isinstance(kwargs, dict):
-        print("tandem.serve: --kwargs: expected a JSON object", file=sys.stderr)
-        return 64
     try:
         serve((env, kwargs), **arguments)
     except ServiceError as error:

@@ -228,8 +228,16 @@ def test_environments_without_goals_and_unknown_ids_are_refused() -> None:
         tandem.EnvironmentServer("CartPole-v1")
     with pytest.raises(tandem.ServiceError, match="no environment 'Nowhere-v0'"):
         tandem.EnvironmentServer("Nowhere-v0")
+    with pytest.raises(tandem.ServiceError, match="no environment 'nowhere:Env-v0': No module named 'nowhere'"):
+        tandem.EnvironmentServer("nowhere:Env-v0")
+    with pytest.raises(tandem.ServiceError, match="cannot create environment 'bad!'"):
+        tandem.EnvironmentServer("bad!")
+    with pytest.raises(tandem.ServiceError, match="cannot create environment .* unexpected keyword argument 'unknown'"):
+        tandem.EnvironmentServer((ID, {"unknown": 1}))
     with pytest.raises(tandem.ServiceError, match="give episode_steps"):
         tandem.EnvironmentServer(goal_env.point_env)
+    with pytest.raises(tandem.ServiceError, match="the task cannot be described"):
+        tandem.EnvironmentServer(ID, reflection=tandem.Reflection(observation=(-1,)))
 
 
 def test_calls_without_the_token_are_refused(tmp_path: Path) -> None:
@@ -248,6 +256,8 @@ def test_calls_without_the_token_are_refused(tmp_path: Path) -> None:
     token.write_text("short")
     with pytest.raises(tandem.ServiceError, match="does not hold a token"):
         tandem.EnvironmentServer(ID, token_file=token)
+    with pytest.raises(tandem.ServiceError, match="cannot use certificate .*token' with key .*token'"):
+        tandem.EnvironmentServer(ID, tls_cert=token, tls_key=token)
 
 
 class Command:
@@ -396,3 +406,11 @@ def test_the_command_takes_arms_and_refuses_bad_ones() -> None:
     assert command.end() == (0, "")
     code, errors = Command(ID, "--arms", "[1]").end()
     assert code == 64 and "argument --arms: expected a list of objects" in errors and errors.count("\n") == 1
+    for option, text, expected in [
+        ("--achieved-goal", '["a", 1]', "expected a JSON list of indices"),
+        ("--achieved-goal", "5", "expected a JSON list of indices"),
+        ("--kwargs", "{foo}", "expected a JSON object, got '{foo}'"),
+        ("--arms", '[{"observation": ["a"]}]', "expected a list of objects"),
+    ]:
+        code, errors = Command(ID, option, text).end()
+        assert code == 64 and f"argument {option}: {expected}" in errors and errors.count("\n") == 1, errors
