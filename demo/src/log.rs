@@ -164,6 +164,7 @@ impl EpisodeLog {
         let settings = WorldSettings::from_log_entries(entry);
         let settings = settings
             .map_err(|key| Error::NotAnEpisode(format!("metadata world.{key} is no number")))?;
+        settings.check().map_err(|error| Error::NotAnEpisode(format!("metadata: {error}")))?;
         Ok(Self {
             layout: Layout::new(task, n_arms),
             run: text("run")?.to_owned(),

@@ -324,4 +324,8 @@ fn a_changed_action_or_world_changes_the_replay() {
         |log| drop(log.metadata.world.insert("substeps".into(), "9".into())),
         "world.substeps is 9",
     );
+    check(
+        |log| drop(log.metadata.world.insert("randomization".into(), "inf".into())),
+        "world.randomization is inf",
+    );
 }

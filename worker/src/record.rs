@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use tandem_core::reward::{REWARD_ACHIEVED, REWARD_PENDING};
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::scene::Scene;
+use tandem_core::settings::OutOfRange;
 use tandem_core::work::{EpisodeOrder, EpisodeStart, RunTerms};
 use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
@@ -63,6 +64,9 @@ pub enum RecordError {
         /// The value, if there is one.
         got: Option<String>,
     },
+    /// A setting of the world is out of its range.
+    #[error(transparent)]
+    Setting(#[from] OutOfRange),
     /// The episode may have started in a way that only earlier versions simulate.
     #[error("the log has {WIDE_START_SHARE} = {0}: this version has no such starts")]
     RemovedStart(String),
@@ -114,6 +118,7 @@ pub fn start_of(metadata: &EpisodeMetadata) -> Result<EpisodeStart, RecordError>
     let entry = |key: &str| metadata.world.get(key).map(String::as_str);
     let settings = WorldSettings::from_log_entries(entry)
         .map_err(|key| RecordError::Metadata { key, got: entry(key).map(str::to_owned) })?;
+    settings.check()?;
     let is_training = metadata.kind == EpisodeKind::Training;
     if let Some(share) = entry(WIDE_START_SHARE).filter(|share| is_training && *share != "0") {
         return Err(RecordError::RemovedStart(share.to_owned()));
