@@ -56,7 +56,6 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
     }
     ledger.settle("leased", &[0])?;
     drop(ledger);
-    fs::remove_file(path.with_extension("sqlite.lock"))?;
     Ok(())
 }
 

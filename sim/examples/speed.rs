@@ -17,7 +17,7 @@ const EPISODES: u64 = 40;
 fn main() -> Result<(), SimError> {
     for substeps in [20, 10] {
         for task in Task::ALL {
-            for n_arms in [1, 2] {
+            for n_arms in task.min_arms()..=2 {
                 let config = WorldConfig { substeps, ..WorldConfig::default() };
                 let steps_per_s = steps_per_s(Layout::new(task, n_arms), &config)?;
                 println!(
