@@ -336,7 +336,7 @@ impl RunConfig {
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
-        reason = "checked: not negative, below 2^32"
+        reason = "checked: not negative, below 2^53"
     )]
     pub fn updates_per_round(&self) -> u64 {
         ((self.env_steps_per_round() as f64 * self.rounds.updates_per_env_step).round() as u64)

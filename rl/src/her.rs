@@ -194,7 +194,7 @@ impl Sampler {
     }
 
     /// Samples whether the parts of all arms are reflected: always possible if the task's whole scene has a mirror image,
-    /// otherwise only while the arms are apart. Recombined arms are apart.
+    /// otherwise only while the arms are apart.
     fn sample_reflection(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         if self.config.reflection_prob == 0.0 || !self.layout.has_reflection() {
             return;

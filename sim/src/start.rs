@@ -92,8 +92,7 @@ fn sample_classic(
 ) -> Vec<ArmStart> {
     let parameters = WorldParameters::of(World::Classic);
     let grasped = bernoulli(rng, settings.grasped_start_prob);
-    // An episode's later draws keep their place in the random stream: this one belonged to a removed hand_start of
-    // start.
+    // Unused. It keeps the later draws at their places in the random stream, so that seeds keep their starts.
     let _: bool = bernoulli(rng, 0.0);
     let can_hold = layout.task.grasps() && object_half_m < parameters.gripper.max_opening_m;
     let hand_start = if grasped && can_hold { HandStart::Grasping } else { HandStart::Centred };

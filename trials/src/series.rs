@@ -62,7 +62,8 @@ impl Series<'_> {
     /// the trial's report and its row without a log. Returns the rows by number.
     ///
     /// # Errors
-    /// Returns the first error of a trial or of `done`.
+    /// Returns the error of a trial or of `done`; if there are several, which one depends on the threads. Other trials may
+    /// then not be carried out.
     pub fn run<E: From<SeriesError> + Send>(
         &self,
         n_trials: u64,

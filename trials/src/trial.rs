@@ -61,8 +61,8 @@ impl<F: FnMut(&[f32], &[f32], &mut [f32])> ActionSource for F {
 pub enum TrialMode {
     /// One motion, computed from an episode in the training world.
     OpenLoop,
-    /// One motion, computed by a closed loop on a copy of the pair without noise and latency and with 20 % less
-    /// friction.
+    /// One motion, computed by a closed loop on a copy of the pair without noise, with the shortest latency and 20 %
+    /// less friction.
     Twin,
     /// One motion per step, with an observation of the table before each.
     ClosedLoop,
@@ -123,9 +123,9 @@ pub struct TrialReport {
     pub rehearsed_m: Option<Vec<f64>>,
     /// The duration of the trial, seconds of simulated time.
     pub duration_s: f64,
-    /// The number of actions that the policy chose.
+    /// The number of steps, including those in which hands only withdrew.
     pub n_steps: usize,
-    /// The number of steps that the check allowed only in part or not at all; 0 without a closed loop.
+    /// The number of steps that the arms did not carry out in full; 0 without a closed loop.
     pub n_shortened: usize,
     /// All contacts of the arms.
     pub touched: Contacts,

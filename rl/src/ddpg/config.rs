@@ -7,8 +7,8 @@ use tandem_core::settings::OutOfRange;
 /// Most transitions of an update.
 const MAX_TRANSITIONS: usize = 65_536;
 
-/// Section `[ddpg]` of the run file: the update. The defaults are those of recipe `tandem` for a student; the paper's
-/// values are in parentheses.
+/// Section `[ddpg]` of the run file: the update. The defaults are those of recipe `tandem` for a student of two
+/// arms in the classic world; the paper's values are in parentheses.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DdpgConfig {

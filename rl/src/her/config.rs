@@ -47,7 +47,7 @@ pub struct ReplayConfig {
     pub coda_fraction: f32,
     /// Probability, in [0, 1], that two steps after which the hands of both arms would overlap are combined into a
     /// transition with a contact. It takes effect where `replay.coda_fraction` does, in tasks that describe at which
-    /// distance hands are in contact, as those of the shared world do.
+    /// distance hands are in contact. No built-in task does: it has to be 0 there.
     #[serde(default)]
     pub coda_contact_prob: f32,
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are

@@ -179,8 +179,8 @@ impl PhysicsWorld {
         );
     }
 
-    /// Returns the contact force of objects on a hand in the last physics step, world frame, newtons. Friction, and
-    /// thus the weight of a held object, is excluded.
+    /// Returns the contact force on a hand in the last physics step, world frame, newtons: that of objects and, on the
+    /// pads, also of the table and the other arm. Friction, and thus the weight of a held object, is excluded.
     pub(crate) fn force_n(&self, arm: usize) -> DVec3 {
         let mut impulse = Vector::ZERO;
         for collider in &self.hands[arm].colliders {
