@@ -262,9 +262,13 @@ class Learner(_Client):
         return progress
 
     def watch(self) -> Iterator[learner_pb2.Progress]:
-        """Yields the progress about once per second. The last message has `ended` set."""
+        """Yields the progress about once per second. The last message has `ended` set.
+
+        The stream itself has no deadline: it is opened once the learner has answered, as any call, within `timeout_s`.
+        """
+        self.status()
         with self._errors():
-            stream = self._stub.Watch(learner_pb2.WatchRequest(), wait_for_ready=True)
+            stream = self._stub.Watch(learner_pb2.WatchRequest())
             try:
                 for progress in stream:
                     yield progress

@@ -17,7 +17,7 @@ Action = NDArray[np.float32]
 EPISODE_STEPS = 50
 """Control steps of an episode."""
 
-_TASKS = {
+TASKS = {
     "tandem/Push-v0": ("push", 1, "classic"),
     "tandem/PickAndPlace-v0": ("pick-and-place", 1, "classic"),
     "tandem/TwoArmPush-v0": ("push", 2, "classic"),
@@ -28,6 +28,7 @@ _TASKS = {
     "tandem/SharedTwoArmPickAndPlace-v0": ("pick-and-place", 2, "shared"),
     "tandem/CarryBar-v0": ("carry-bar", 2, "slow"),
 }
+"""Task, number of arms and world of the simulator's environments."""
 _FETCH_TASKS = {"tandem/TwoFetchPush-v0": "push", "tandem/TwoFetchPickAndPlace-v0": "pick-and-place"}
 
 RENDER_FPS = {"classic": 25, "shared": 4, "slow": 4}
@@ -201,7 +202,7 @@ def check_rendering(render_mode: str | None, width: int, height: int) -> None:
 
 def register_envs() -> None:
     """Registers the environments with Gymnasium, once."""
-    for env_id, (task, n_arms, world) in _TASKS.items():
+    for env_id, (task, n_arms, world) in TASKS.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
                 env_id,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tandem import _native
+from tandem.envs import TASKS
 
 if TYPE_CHECKING:
     from tandem.torch_policy import TorchPolicy
@@ -29,7 +30,7 @@ class Policy:
 
     @property
     def task(self) -> str:
-        """Name of the task: `push`, `pick-and-place`, the same with `shared-`, or `carry-bar`."""
+        """Name of the task: a built-in one, such as `shared-push`, or one that was served, such as `fetchpush-v4`."""
         return self._native.task
 
     @property
@@ -39,11 +40,15 @@ class Policy:
 
     @property
     def env_id(self) -> str:
-        """Name of the environment with the policy's task, for `gymnasium.make`."""
-        task = self.task.removeprefix("shared-")
-        world = "Shared" if task != self.task else ""
-        arms = "TwoArm" if self.n_arms == 2 and task != "carry-bar" else ""
-        return f"tandem/{world}{arms}{task.title().replace('-', '')}-v0"
+        """Name of the environment with the policy's task, for `gymnasium.make`.
+
+        Raises:
+            ValueError: The task is not of this package's simulator.
+        """
+        for env_id, (task, n_arms, world) in TASKS.items():
+            if (f"shared-{task}" if world == "shared" else task, n_arms) == (self.task, self.n_arms):
+                return env_id
+        raise ValueError(f"task {self.task!r} is not of this package's simulator: create its environment by its own id")
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -131,4 +136,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 def _rows(array: ArrayLike) -> _Floats:
     """Returns an array of shape `[n]` or `[batch, n]` as `[batch, n]`."""
-    return np.atleast_2d(np.asarray(array, dtype=np.float32))
+    rows = np.atleast_2d(np.asarray(array, dtype=np.float32))
+    if rows.ndim > 2:
+        raise ValueError(f"an array has {rows.ndim} dimensions, expected 1 or 2")
+    return rows

@@ -42,6 +42,11 @@ def test_nothing_that_answers_is_an_error_within_the_timeout():
     ):
         teacher.describe()
     assert raised.value.is_temporary
+    with (
+        tandem.Learner("127.0.0.1:1", timeout_s=0.3) as learner,
+        pytest.raises(tandem.CallError, match="no answer within 0.3 s"),
+    ):
+        next(learner.watch())
 
 
 def test_a_motion_is_played_to_its_end():

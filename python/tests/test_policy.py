@@ -90,6 +90,10 @@ def test_properties_come_from_the_file():
     path = ROOT / "policies/student-pick-and-place-classic.safetensors"
     policy = tandem.load_policy(path)
     assert (policy.task, policy.n_arms, policy.env_id) == ("pick-and-place", 2, "tandem/TwoArmPickAndPlace-v0")
+    shared = tandem.load_policy(ROOT / "policies/teacher-push.safetensors")
+    assert (shared.task, shared.n_arms, shared.env_id) == ("shared-push", 1, "tandem/SharedPush-v0")
+    bar = tandem.load_policy(ROOT / "policies/student-carry-bar.safetensors")
+    assert (bar.task, bar.n_arms, bar.env_id) == ("carry-bar", 2, "tandem/CarryBar-v0")
     assert len(policy.digest) == 64 and policy.digest[:12] in repr(policy)
     expected = safetensors.load_file(path)
     tensors = policy.tensors()
@@ -106,6 +110,8 @@ def test_wrong_inputs_are_refused(rng):
         policy.predict({**observation, "desired_goal": observation["desired_goal"][:2]})
     with pytest.raises(ValueError, match="not finite"):
         policy.predict({**observation, "desired_goal": observation["desired_goal"] * np.nan})
+    with pytest.raises(ValueError, match="3 dimensions, expected 1 or 2"):
+        policy.predict({**observation, "desired_goal": observation["desired_goal"][None]})
 
 
 def test_files_that_cannot_be_used_are_refused(tmp_path):
