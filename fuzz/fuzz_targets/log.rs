@@ -28,7 +28,7 @@ fuzz_target!(|file: &[u8]| {
             let copy = read_episode(&recovered_path);
             assert!(!matches!(copy, Err(Error::ReadLog { .. })), "not whole: {copy:?}");
         }
-        (Err(_), Err(error)) => assert!(matches!(error, Error::ReadLog { .. }), "{error:?}"),
+        (Err(_), Err(error)) => assert!(matches!(error, Error::NotMcap { .. }), "{error:?}"),
     }
 });
 
