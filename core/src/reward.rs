@@ -32,7 +32,7 @@ pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. NaN is no achieved goal.
+/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. At NaN the goal is not achieved.
 #[must_use]
 pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
     if distance <= tolerance { REWARD_ACHIEVED } else { REWARD_PENDING }

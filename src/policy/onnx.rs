@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 use tandem_core::rng::uniform;
+use tandem_core::task::Norm;
 use tandem_core::{Layout, Stream, episode_rng};
 use tandem_onnx::binding::layout_of;
 use tandem_onnx::{
@@ -76,7 +77,7 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
             anyhow::anyhow!(
                 "{}: the policy differs from the model by {:.1e}, because its numbers are too large for float32",
                 args.actor.display(),
-                larger(differences[0], differences[1])
+                Norm::Maximum.combined(differences[0], differences[1])
             ),
         ));
     }
@@ -134,10 +135,5 @@ fn largest_difference(got: &[f32], expected: &[f32]) -> f32 {
     let differences = got.iter().zip(expected);
     let relative =
         differences.map(|(got, expected)| (got - expected).abs() / expected.abs().max(1.0));
-    relative.fold(0.0, larger)
-}
-
-/// Returns the larger number, or NaN if one of them is.
-const fn larger(a: f32, b: f32) -> f32 {
-    if a.is_nan() || a > b { a } else { b }
+    relative.fold(0.0, |largest, next| Norm::Maximum.combined(largest, next))
 }

@@ -131,7 +131,7 @@ impl Norm {
         }
     }
 
-    /// Returns the share that two accumulated parts have together.
+    /// Returns the share that two accumulated parts have together; NaN if one of them is.
     #[must_use]
     pub const fn combined(self, first: f32, second: f32) -> f32 {
         match self {

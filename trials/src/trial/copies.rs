@@ -1,7 +1,7 @@
 //! Copies of the pair, on which motions without feedback are rehearsed and tried.
 //!
-//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. A blind
-//! motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their
+//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. Such
+//! a motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their
 //! noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
 
 use tandem_kinematics::Joints;
