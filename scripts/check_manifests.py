@@ -18,6 +18,9 @@ ROOT = Path(__file__).resolve().parent.parent
 WORKLOADS = ("Deployment", "StatefulSet", "Job")
 # The secrets that docs/cluster.md describes.
 SECRETS = {"tandem-secrets": {"token", "redis-password"}}
+# A pod that someone else starts to call the services that it may call, see deploy/kubernetes/base/network.yaml.
+OPERATOR = {"metadata": {"name": "operator"}, "spec": {"template": {"metadata": {"labels": {"tandem-operator": "true"}}}}}
+OPERATOR_CALLS = [("learner", 7000), ("bridge", 7002)]
 # gRPC probes are stable since 1.27.
 VERSIONS = ("1.27.0", "1.37.0")
 
@@ -123,6 +126,10 @@ class Checked:
         for found in objects:
             if found["kind"] == "NetworkPolicy":
                 self.check_policy(found)
+                # The sweep has neither of them.
+                if found["metadata"]["name"] == "operator":
+                    for host, port in OPERATOR_CALLS:
+                        self.check_call(OPERATOR, host, port)
             if found["kind"] == "PodDisruptionBudget":
                 self.expect(len(self.selected(found["spec"]["selector"])) == 1, f"budget {found['metadata']['name']} selects no one")
 
@@ -131,7 +138,7 @@ class Checked:
             self.problems.append(otherwise)
 
     def selected(self, selector):
-        return selected(selector.get("matchLabels", {}), self.workloads)
+        return selected(selector.get("matchLabels", {}), [*self.workloads, OPERATOR])
 
     def check_workload(self, workload):
         name, spec = workload["metadata"]["name"], workload["spec"]
@@ -353,6 +360,7 @@ MISTAKES = [
     ("base/redis.yaml", "clusterIP: None", "clusterIP: \"\""),
     ("base/network.yaml", "- port: 6379", "- port: 6378"),
     ("base/network.yaml", "app.kubernetes.io/component: bridge", "app.kubernetes.io/component: bridges"),
+    ("base/network.yaml", "- port: 7002\n---\n# Pods of", "- port: 7003\n---\n# Pods of"),
     ("base/kustomization.yaml", "newTag: 0.1.0", "newTag: 0.0.9"),
     ("base/kustomization.yaml", "  - redis.yaml\n", ""),
     ("base/run.toml", "slots = 16", "slots = 4"),

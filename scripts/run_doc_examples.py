@@ -48,7 +48,8 @@ def server(command: str):
     """Runs a command until the block is left, and enters it once the address after `--listen` accepts connections."""
     host, port = LISTEN.search(command).groups()
     with tempfile.TemporaryDirectory() as directory:
-        path = f"{ROOT / 'target/release'}:{os.environ['PATH']}"
+        programs = ROOT / os.environ.get("CARGO_TARGET_DIR", "target") / "release"
+        path = f"{programs}:{os.environ['PATH']}"
         environment = {**os.environ, "PATH": path, "WORK": directory}
         process = subprocess.Popen(["bash", "-c", f"exec {command}"], cwd=ROOT, env=environment)
         try:

@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 cargo build --release --locked
-tandem=$PWD/target/release/tandem
+tandem=$(realpath "${CARGO_TARGET_DIR:-target}")/release/tandem
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 

@@ -25,7 +25,7 @@ fn rows(out: &Path) -> Vec<Value> {
 fn trials_are_evaluated_and_recorded() {
     let dir = tempfile::tempdir().expect("a directory");
     let args = ["--policy", STUDENT, "--composed-teachers", TEACHER, "--trials", "1", "--json"];
-    let more = ["--record", "all", "--seed", "2", "--motions"];
+    let more = ["--record", "all", "--seed", "2", "--motions", "--rehearsals", "2"];
     let output = trial(dir.path(), &[&args[..], &more].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let printed: Value = serde_json::from_slice(&output.stdout).expect("one object");

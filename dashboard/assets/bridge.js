@@ -240,6 +240,7 @@ function showLink() {
 const sinceHeard = follow(show, (condition) => {
   // A bridge that starts again may begin with other versions.
   if (condition === "live" && link === "lost") logVersion = null;
+  if (condition === "lost") document.title = "No connection – Tandem bridge";
   link = condition;
   showLink();
 });

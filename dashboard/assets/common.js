@@ -1,5 +1,8 @@
 // Elements, formats and the stream of states, for all pages.
 
+/** Time after which a hidden page closes its connection, milliseconds. */
+const HIDDEN_MS = 5000;
+
 export const byId = (id) => document.getElementById(id);
 
 /** Returns an element with attributes and children; `null` attributes are left out. */
@@ -59,13 +62,20 @@ export async function fetchJson(path) {
 
 /**
  * Calls `onState` with every state, and `onLink` with the condition of the connection: "live", "lost" or "full".
- * A lost connection is opened again for as long as the page exists.
+ * A lost connection is opened again for as long as the page exists. A hidden page closes it after a while: browsers open
+ * six connections to an address, and the stop button of another page needs one.
  */
 export function follow(onState, onLink) {
   let source = null;
   let heardAt = performance.now();
-  const open = () => {
+  let hidden = null;
+  const close = () => {
     source?.close();
+    source = null;
+  };
+  const open = () => {
+    close();
+    if (document.hidden) return;
     source = new EventSource("/events");
     source.onopen = () => {
       heardAt = performance.now();
@@ -87,8 +97,16 @@ export function follow(onState, onLink) {
     };
   };
   open();
-  addEventListener("pagehide", () => source?.close());
+  addEventListener("pagehide", close);
   addEventListener("pageshow", (event) => event.persisted && open());
+  document.addEventListener("visibilitychange", () => {
+    clearTimeout(hidden);
+    if (!document.hidden) return source === null && open();
+    hidden = setTimeout(() => {
+      close();
+      onLink("lost");
+    }, HIDDEN_MS);
+  });
   return () => performance.now() - heardAt;
 }
 

@@ -24,19 +24,34 @@ class App {
     this.owed_s = 0;
     this.times = [];
     this.n_steps = 0;
+    this.n_choices = 0;
+    this.isReady = false;
     this.bind();
   }
 
   /** Loads the student of a task. */
   async choose(task) {
+    const choice = ++this.n_choices;
     this.isReady = false;
     show(badge, "Loading", "");
-    const response = await fetch(`student-${task}.safetensors.gz`);
-    if (!response.ok) throw new Error(`the policy: ${response.status} ${response.statusText}`);
-    this.policy = new Uint8Array(await decompressed(await response.blob()));
-    this.task = task;
-    this.load();
-    $("digests").hidden = $("digest-verdict").hidden = true;
+    try {
+      const response = await fetch(`student-${task}.safetensors.gz`);
+      if (!response.ok) throw new Error(`the policy: ${response.status} ${response.statusText}`);
+      const policy = new Uint8Array(await decompressed(await response.blob()));
+      // A later choice has been made meanwhile.
+      if (choice !== this.n_choices) return;
+      this.policy = policy;
+      this.task = task;
+      this.load();
+      $("digests").hidden = $("digest-verdict").hidden = true;
+    } catch (error) {
+      if (choice !== this.n_choices) return;
+      // The student before, if there is one, plays on.
+      this.isReady = this.task !== undefined;
+      for (const radio of tasks()) radio.checked = radio.value === this.task;
+      if (this.status) this.update(this.status);
+      throw error;
+    }
   }
 
   load() {
@@ -291,9 +306,14 @@ class App {
     $("compute").disabled = true;
     $("compute").textContent = "Computing …";
     try {
+      const { policy, facts: { task } } = this;
       // A worker of its own: the scene stays in motion.
-      const here = await inWorker(this.policy);
-      const native = (await (await fetch("digests.json")).json())[this.facts.task];
+      const here = await inWorker(policy);
+      const response = await fetch("digests.json");
+      if (!response.ok) throw new Error(`digests.json: ${response.status} ${response.statusText}`);
+      const native = (await response.json())[task];
+      // Another student has been chosen meanwhile.
+      if (this.policy !== policy) return;
       $("digest-here").textContent = here;
       $("digest-native").textContent = native;
       $("digests").hidden = false;
@@ -389,6 +409,7 @@ function showVerdict(id, text, isGood) {
   $(id).hidden = false;
 }
 
+const tasks = () => [...document.querySelectorAll("input[name=task]")];
 const cm = metres => `${Math.round(100 * metres)} cm`;
 const seconds = time_s => `${time_s.toFixed(1)} s`;
 
@@ -409,6 +430,7 @@ async function attempt(action) {
 
 attempt(async () => {
   const app = new App(await Simulator.load("tandem_demo.wasm.gz"));
-  await app.choose("push");
   requestAnimationFrame(now => app.frame(now));
+  // A browser that loads the page again keeps the choice.
+  await app.choose(tasks().find(radio => radio.checked).value);
 });

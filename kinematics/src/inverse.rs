@@ -52,8 +52,8 @@ pub struct Solution {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReachError {
-    /// A number of the target or of the seed is infinite or NaN.
-    #[error("the target is not finite")]
+    /// A number of the target or of the present joint angles, from which the search starts, is infinite or NaN.
+    #[error("the target or the present joint angles are not finite")]
     NotFinite,
     /// The target is farther from the shoulder than the arm is long.
     #[error("the target is {distance_m:.3} m from the shoulder, the arm reaches {reach_m:.3} m")]

@@ -116,11 +116,15 @@ fn check_settings(settings: &PlanSettings) -> Result<(), PlanError> {
 
 fn check_start(cell: &WorkCell, start: &[Joints]) -> Result<(), PlanError> {
     let expected = cell.arms.len();
-    let fits = start.iter().zip(&cell.arms).all(|(q, arm)| q.len() == arm.model.n_joints());
-    if start.len() != expected || !fits {
-        return Err(PlanError::Arms { waypoint: 0, got: start.len(), expected });
+    if start.len() != expected {
+        return Err(PlanError::StartArms { got: start.len(), expected });
     }
-    Ok(())
+    let lengths = start.iter().zip(&cell.arms).enumerate();
+    let lengths = lengths.map(|(arm, (q, of))| (ArmIndex(arm), q.len(), of.model.n_joints()));
+    match lengths.into_iter().find(|(_, got, expected)| got != expected) {
+        Some((arm, got, expected)) => Err(PlanError::StartJoints { arm, got, expected }),
+        None => Ok(()),
+    }
 }
 
 /// Checks the waypoints and returns the largest distance between consecutive ones, metres.

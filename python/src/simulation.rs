@@ -93,14 +93,21 @@ impl Simulation {
     }
 
     /// Executes `actions`, shape `[n, n_action]`, and returns the observations after each, shape `[n, n_observation]`.
+    /// If the shape is another one, no action is executed.
     fn play<'py>(
         &mut self,
         py: Python<'py>,
         actions: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
         self.check_started()?;
-        let (actions, n_action) =
-            (actions.as_array().iter().copied().collect::<Vec<f32>>(), self.n_action());
+        let (actions, n_action) = (actions.as_array(), self.n_action());
+        if actions.ncols() != n_action {
+            let got = actions.dim();
+            return Err(value_error(format!(
+                "actions have shape {got:?}, expected (n, {n_action})"
+            )));
+        }
+        let actions: Vec<f32> = actions.iter().copied().collect();
         let mut observations = Vec::new();
         let episode = &mut self.episode;
         let mut play = || {

@@ -104,7 +104,8 @@ impl VectorSimulation {
     }
 
     /// Starts the first episodes of the runs of `seeds`, or without seeds the next episodes, in the environments of
-    /// `mask`. Both have shape `[num_envs]`. Returns observations and infos of all environments.
+    /// `mask`. Both have shape `[num_envs]`. An environment outside `mask` that never started keeps its seed for its first
+    /// episode. Returns observations and infos of all environments.
     fn reset<'py>(
         &mut self,
         py: Python<'py>,
@@ -118,8 +119,13 @@ impl VectorSimulation {
         let (slots, threads) = (&mut self.slots, &self.threads);
         let start = |(idx, slot): (usize, &mut Slot)| {
             slot.last = None;
+            let seed = seeds.as_ref().map(|seeds| seeds[idx]);
             if mask[idx] {
-                slot.start(seeds.as_ref().map(|seeds| seeds[idx]));
+                slot.start(seed);
+            } else if let Some(seed) = seed
+                && !slot.is_started
+            {
+                slot.seed = seed;
             }
         };
         py.detach(|| threads.install(|| slots.par_iter_mut().enumerate().for_each(start)));
@@ -238,11 +244,12 @@ impl Slot {
         Ok(())
     }
 
-    /// Starts the first episode of the run of `seed`, or the next one of the current run.
+    /// Starts the first episode of the run of `seed`, or without a seed the next one of the current run.
     fn start(&mut self, seed: Option<u64>) {
         (self.seed, self.number) = match seed {
             Some(seed) => (seed, 0),
-            None => (self.seed, self.number + 1),
+            None if self.is_started => (self.seed, self.number + 1),
+            None => (self.seed, 0),
         };
         self.episode.start(self.seed, self.number);
         (self.n_steps, self.is_started, self.is_over) = (0, true, false);

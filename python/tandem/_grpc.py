@@ -28,6 +28,21 @@ _OPTIONS = [
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
 ]
+_CHANNEL_OPTIONS = [
+    *_OPTIONS,
+    # A connection whose other end is gone fails after twenty seconds, also while a stream waits.
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.http2.max_pings_without_data", 0),
+]
+_SERVER_OPTIONS = [
+    *_OPTIONS,
+    # Ports are not shared: a second server on the same port fails.
+    ("grpc.so_reuseport", 0),
+    # All clients of Tandem probe idle connections; without these the server would close them as too busy.
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_ping_strikes", 0),
+]
 _UNARY_THREADS = 4
 _SERVING = b"\x08\x01"
 """An encoded `grpc.health.v1.HealthCheckResponse` with status SERVING."""
@@ -138,10 +153,8 @@ class Server:
         if (tls_cert is None) != (tls_key is None):
             raise ServiceError("TLS needs both a certificate and its key")
         interceptors = [] if token_file is None else [_RequireToken(read_token(token_file))]
-        # Ports are not shared: a second server on the same port fails.
-        options = [*_OPTIONS, ("grpc.so_reuseport", 0)]
         threads = ThreadPoolExecutor(max_streams + _UNARY_THREADS, thread_name_prefix="tandem")
-        server = grpc.server(threads, interceptors=interceptors, options=options)
+        server = grpc.server(threads, interceptors=interceptors, options=_SERVER_OPTIONS)
         add_service(server)
         health = {"Check": grpc.unary_unary_rpc_method_handler(lambda _request, _context: _SERVING)}
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("grpc.health.v1.Health", health),))
@@ -188,9 +201,9 @@ def open_channel(address: str, token_file: Path | None = None, tls_ca: Path | No
         raise ServiceError(f"{address} requires TLS: give its authority's certificate as tls_ca")
     target = f"{host}:{port}"
     if tls_ca is None:
-        channel = grpc.insecure_channel(target, options=_OPTIONS)
+        channel = grpc.insecure_channel(target, options=_CHANNEL_OPTIONS)
     else:
-        channel = grpc.secure_channel(target, grpc.ssl_channel_credentials(_read(tls_ca)), options=_OPTIONS)
+        channel = grpc.secure_channel(target, grpc.ssl_channel_credentials(_read(tls_ca)), options=_CHANNEL_OPTIONS)
     if token_file is None:
         return channel
     return grpc.intercept_channel(channel, _SendToken(read_token(token_file)))

@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -65,6 +66,25 @@ def server() -> Iterator[tandem.EnvironmentServer]:
 @pytest.fixture(scope="module")
 def client(server: tandem.EnvironmentServer) -> Client:
     return Client(server)
+
+
+def test_a_connection_may_be_probed_while_it_is_idle(server: tandem.EnvironmentServer) -> None:
+    def frame(kind: int, flags: int, data: bytes = b"") -> bytes:
+        return len(data).to_bytes(3, "big") + bytes([kind, flags, 0, 0, 0, 0]) + data
+
+    settings, ping, goaway, is_answer = 4, 6, 7, 1
+    host, port = server.address.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection, connection.makefile("rb") as answers:
+        connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + frame(settings, 0))
+        for number in range(10):
+            connection.sendall(frame(ping, 0, bytes([number] * 8)))
+            answer = None
+            while answer != (ping, is_answer):
+                head = answers.read(9)
+                answer = (head[3], head[4])
+                body = answers.read(int.from_bytes(head[:3], "big"))
+                assert head[3] != goaway, body
+            assert body == bytes([number] * 8)
 
 
 def test_the_task_is_found_by_probing(client: Client) -> None:

@@ -66,6 +66,17 @@ def test_environments_that_are_not_reset_automatically_wait_for_a_reset():
     assert np.array_equal(observations["observation"][2], single["observation"])
 
 
+@pytest.mark.parametrize("seed", [None, 4])
+def test_environments_left_out_of_the_first_reset_keep_their_seeds(seed):
+    envs, all_at_once = (tandem.TandemVectorEnv(3, "push", 1) for _ in range(2))
+    for each in (envs, all_at_once):
+        each._np_random = np.random.default_rng(7)
+    expected = all_at_once.reset(seed=seed)[0]["observation"]
+    envs.reset(seed=seed, options={"reset_mask": np.array([True, False, False])})
+    observations = envs.reset(options={"reset_mask": np.array([False, True, True])})[0]["observation"]
+    assert np.array_equal(observations, expected)
+
+
 def test_the_number_of_threads_changes_no_bit(rng):
     actions = rng.uniform(-1, 1, (12, 5, 8))
     courses = []

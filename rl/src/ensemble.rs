@@ -7,7 +7,9 @@
 
 use tandem_core::work::PublishedGate;
 use tandem_core::{Stream, TaskSpec, episode_rng};
-use tandem_policy::{Adam, Matrix, MatrixMut, MlpShape, Workspace, backward_parameters, forward};
+use tandem_policy::{
+    Adam, Matrix, MatrixMut, MlpShape, Workspace, all_finite, backward_parameters, forward,
+};
 
 use crate::ddpg::{CriticBatch, DdpgConfig};
 
@@ -63,15 +65,17 @@ impl CriticEnsemble {
         }
     }
 
-    /// Makes one gradient step of every critic toward the targets of `batch`.
+    /// Makes one gradient step of every critic toward the targets of `batch`. Returns true if all parameters are finite.
     ///
     /// # Panics
     /// When the batch has another size.
-    pub fn update(&mut self, batch: CriticBatch<'_>) {
+    #[must_use]
+    pub fn update(&mut self, batch: CriticBatch<'_>) -> bool {
         let Self { shape, batch_size, members, workspace, q, q_gradient, gradient } = self;
         let n_rows = q.len() / shape.n_output;
         let inputs = Matrix::new(batch.inputs, n_rows, shape.n_input);
         assert_eq!(batch.targets.len(), q.len(), "targets for another number of heads");
+        let mut are_finite = true;
         for Member { parameters, adam } in members {
             let mut values = MatrixMut::new(q, n_rows, shape.n_output);
             forward(shape, parameters, inputs, workspace, &mut values);
@@ -80,7 +84,9 @@ impl CriticEnsemble {
             }
             backward_parameters(shape, parameters, inputs, workspace, q_gradient, gradient);
             adam.step(parameters, gradient);
+            are_finite &= all_finite(parameters);
         }
+        are_finite
     }
 
     /// Returns the critics for the workers, with the threshold of the strategy.
@@ -172,7 +178,7 @@ mod tests {
         let (known, unknown, targets) = (draw(B * n_input), draw(B * n_input), draw(2 * B));
         let before = disagreement(&mut ensemble, &known);
         for _ in 0..300 {
-            ensemble.update(CriticBatch { inputs: &known, targets: &targets });
+            assert!(ensemble.update(CriticBatch { inputs: &known, targets: &targets }));
         }
         let (seen, unseen) =
             (disagreement(&mut ensemble, &known), disagreement(&mut ensemble, &unknown));
@@ -184,16 +190,24 @@ mod tests {
         let mut ensemble = ensemble();
         let inputs = vec![0.25; B * ensemble.shape.n_input];
         let batch = CriticBatch { inputs: &inputs, targets: &[-1.0; 2 * B] };
-        ensemble.update(batch);
+        assert!(ensemble.update(batch));
         let stored: Vec<Vec<f32>> =
             ensemble.state().into_iter().map(|(_, vector)| vector.to_vec()).collect();
         let mut restored = self::ensemble();
         restored.restore(&stored, 1).expect("fits");
-        ensemble.update(batch);
-        restored.update(batch);
+        assert!(ensemble.update(batch) && restored.update(batch));
         assert_eq!(restored.state(), ensemble.state());
         assert!(restored.restore(&stored[1..], 1).is_err());
         let gate = ensemble.publish(0.5);
         assert_eq!((gate.n_critics, gate.critics.len()), (3, 3 * stored[0].len()));
+    }
+
+    #[test]
+    fn an_update_says_when_parameters_are_no_longer_finite() {
+        let mut ensemble = ensemble();
+        let mut inputs = vec![0.25; B * ensemble.shape.n_input];
+        assert!(ensemble.update(CriticBatch { inputs: &inputs, targets: &[-1.0; 2 * B] }));
+        inputs[3] = f32::NAN;
+        assert!(!ensemble.update(CriticBatch { inputs: &inputs, targets: &[-1.0; 2 * B] }));
     }
 }

@@ -59,6 +59,7 @@ impl ReplayBuffer {
     ) -> Option<Self> {
         let mut buffer = Self::new(layout, capacity_transitions);
         let layout = &buffer.layout;
+        let has_arms = |arms: u8| (layout.n_arms()..8).all(|arm| arms & (1 << arm) == 0);
         let (n, n_steps) = (parts.moved.len(), layout.episode_steps());
         // A buffer that is not full grows at its end; a full one wraps around.
         let expected_next = if n < buffer.capacity_episodes { n..n + 1 } else { 0..n };
@@ -68,7 +69,10 @@ impl ReplayBuffer {
             && parts.goals.len() == n * layout.n_goal()
             && parts.actions.len() == n * n_steps * layout.n_action()
             && parts.advised_arms.len() == n * n_steps
-            && parts.contacts.len() == n * n_steps;
+            && parts.contacts.len() == n * n_steps
+            && parts.moved.iter().all(|moved| *moved <= 1)
+            && parts.advised_arms.iter().all(|arms| has_arms(*arms))
+            && parts.contacts.iter().all(|bits| Contacts::from_bits(*bits).is_some());
         if !fits {
             return None;
         }
@@ -271,6 +275,14 @@ mod tests {
         let mut torn = parts.clone();
         torn.actions.pop();
         assert_eq!(ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, torn, next), None);
+        let altered = [
+            ReplayParts { moved: vec![2, 1], ..parts.clone() },
+            ReplayParts { advised_arms: vec![0b100; 2 * EPISODE_STEPS], ..parts.clone() },
+            ReplayParts { contacts: vec![0b100; 2 * EPISODE_STEPS], ..parts.clone() },
+        ];
+        for parts in altered {
+            assert_eq!(ReplayBuffer::from_parts(LAYOUT, 2 * EPISODE_STEPS, parts, next), None);
+        }
         let of_capacity = |n_episodes, next| {
             ReplayBuffer::from_parts(LAYOUT, n_episodes * EPISODE_STEPS, parts.clone(), next)
         };

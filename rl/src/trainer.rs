@@ -252,8 +252,11 @@ impl Trainer {
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
             let losses = self.ddpg.update(&self.batch)?;
-            if let Some(ensemble) = &mut self.ensemble {
-                ensemble.update(self.ddpg.critic_batch());
+            if let Some(ensemble) = &mut self.ensemble
+                && !ensemble.update(self.ddpg.critic_batch())
+            {
+                let what = "a parameter of the ensemble of critics";
+                return Err(DdpgError::NotFinite { what, update: self.ddpg.n_updates() });
             }
             if self.config.rounds.polyak_every == PolyakEvery::Update {
                 self.ddpg.polyak();

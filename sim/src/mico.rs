@@ -206,7 +206,7 @@ pub(crate) fn single(value: f64) -> f32 {
 }
 
 /// Returns the length of a vector from its square, which has the same bits on every platform.
-fn hypotenuse(x: f32, y: f32) -> f32 {
+pub(crate) fn hypotenuse(x: f32, y: f32) -> f32 {
     (x * x + y * y).sqrt()
 }
 

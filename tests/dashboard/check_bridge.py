@@ -178,6 +178,17 @@ def check_layout(page):
     page.check_names()
 
 
+def check_hidden(page):
+    """A hidden page leaves its connection to others, and has a new one when it is visible again."""
+    link = "document.getElementById('link').textContent"
+    switch = ("Object.defineProperty(document, 'hidden', {{ value: {}, configurable: true }}); "
+              "void document.dispatchEvent(new Event('visibilitychange'))")
+    page.value(switch.format("true"))
+    page.wait(f"{link}.includes('no connection') && document.title.startsWith('No connection')", "the page rests", 10)
+    page.value(switch.format("false"))
+    page.wait(f"{link} === 'live' && !document.title.startsWith('No')", "the page is live again", 5)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--program", type=pathlib.Path, required=True)
@@ -208,6 +219,7 @@ def main():
         with_motion(bridge, page, by_keyboard)
         check_drill(page, bridge)
         check_layout(page)
+        check_hidden(page)
         bridge.process.send_signal(signal.SIGTERM)
         page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)
         assert bridge.process.wait(20) == 0

@@ -215,7 +215,11 @@ fn an_idle_policy_does_not_reach_its_goals_and_is_observed() {
     {
         let mut idle = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.0);
         let mut watching = Watching::default();
-        let config = TrialConfig { time_limit_s: 20.0, ..config(Task::PickAndPlace, mode, 1) };
+        let config = TrialConfig {
+            time_limit_s: 20.0,
+            n_rehearsals: 2,
+            ..config(Task::PickAndPlace, mode, 1)
+        };
         let mut trials = TrialRunner::new(config).unwrap();
         let report = trials.run(0, &mut idle, &mut watching).unwrap();
         assert_eq!(report.cause.map(|cause| cause.name()), Some(cause), "{mode:?}");

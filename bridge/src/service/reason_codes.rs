@@ -106,6 +106,8 @@ pub(super) fn of_plan(error: &PlanError) -> (ReasonCode, Option<usize>, Option<u
     match error {
         P::Setting { .. } => (code("setting", None, None), None, None),
         P::WaypointCount { .. } => (code("way-points", None, None), None, None),
+        P::StartArms { .. } => (code("arms", None, None), None, None),
+        P::StartJoints { arm, .. } => (code("joints", None, None), None, Some(arm.0)),
         P::Arms { waypoint, .. } => (code("arms", None, None), Some(*waypoint), None),
         P::GripperOpening { waypoint, arm, gripper_opening: opening } => {
             (code("opening", None, number(*opening, "")), Some(*waypoint), Some(arm.0))

@@ -19,7 +19,7 @@ use tandem_core::{
 use tandem_fuzz::sample;
 use tandem_learner::checkpoint::{self, Resumption};
 use tandem_learner::evaluation_store::{EvaluationHistory, PendingEvaluation};
-use tandem_proto::environment::{encode_reset, encode_step_reply};
+use tandem_proto::environment::{encode_reset, encode_reset_reply, encode_step_reply};
 use tandem_proto::pb;
 use tandem_rl::trainer::Trainer;
 use tandem_telemetry::MetricsRow;
@@ -198,11 +198,17 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
         ("execute", execute_request().encode_to_vec()),
         ("advise", asked.encode_to_vec()),
         ("play", encode_reset(&[start]).encode_to_vec()),
-        ("played", encode_step_reply(&[0.25; 56], &[Contacts::ARM_ARM]).encode_to_vec()),
+        (
+            "played",
+            encode_step_reply(&[0.25; 56], &[Contacts::ARM_ARM, Contacts::NONE]).encode_to_vec(),
+        ),
     ];
     for (message, (name, bytes)) in (0_u8..).zip(seeds) {
         fs::write(to.join(name), [&[message, 0], bytes.as_slice()].concat())?;
     }
+    // A second message of the last type: the response to a reset of two environments.
+    let started = encode_reset_reply(&[0.25; 56], &[0.5; 6]).encode_to_vec();
+    fs::write(to.join("started"), [&[11, 0], started.as_slice()].concat())?;
     Ok(())
 }
 

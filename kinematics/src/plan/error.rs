@@ -23,12 +23,30 @@ pub enum PlanError {
         /// The number of waypoints.
         got: usize,
     },
-    /// A waypoint, or the start, does not match the arms and joints of the cell.
+    /// The start has another number of arms than the cell.
+    #[error("the start has {got} arms, the cell has {expected}")]
+    StartArms {
+        /// Arms of the start.
+        got: usize,
+        /// Arms of the cell.
+        expected: usize,
+    },
+    /// The start has another number of joints than an arm of the cell.
+    #[error("the start of arm {} has {got} joints, the arm has {expected}", arm.0)]
+    StartJoints {
+        /// The arm.
+        arm: ArmIndex,
+        /// Joints of the start.
+        got: usize,
+        /// Joints of the arm.
+        expected: usize,
+    },
+    /// A waypoint has another number of arms than the cell.
     #[error("waypoint {waypoint} has {got} arms, the cell has {expected}")]
     Arms {
         /// The waypoint.
         waypoint: usize,
-        /// Arms of the waypoint or of the start.
+        /// Arms of the waypoint.
         got: usize,
         /// Arms of the cell.
         expected: usize,

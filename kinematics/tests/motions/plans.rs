@@ -234,6 +234,12 @@ fn invalid_waypoints_and_settings_are_refused() {
         let error = plan(&cell, &waypoints, &start, &PlanSettings::default()).unwrap_err();
         assert!(expected(&error), "{error}");
     };
+    let refusal = |start: &[Joints]| {
+        plan(&cell, &good, start, &PlanSettings::default()).unwrap_err().to_string()
+    };
+    assert_eq!(refusal(&start[..1]), "the start has 1 arms, the cell has 2");
+    let short = [start[0], Joints::new(&start[1][..3])];
+    assert_eq!(refusal(&short), "the start of arm 1 has 3 joints, the arm has 4");
     check(&|points| points.truncate(1), |e| matches!(e, PlanError::WaypointCount { got: 1 }));
     check(&|points| points[4].truncate(1), |e| {
         matches!(e, PlanError::Arms { waypoint: 4, got: 1, expected: 2 })

@@ -254,7 +254,7 @@ impl Reader<'_> {
         let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);
         let capacity = trainer.config.replay.capacity_transitions;
         trainer.replay = ReplayBuffer::from_parts(&trainer.layout, capacity, parts, next)
-            .ok_or("its replay buffer does not fit replay.capacity_transitions in the run file")?;
+            .ok_or("its replay buffer is invalid or does not fit replay.capacity_transitions in the run file")?;
         Ok(())
     }
 

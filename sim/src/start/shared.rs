@@ -11,7 +11,7 @@ use tandem_core::rng::{bernoulli, uniform};
 use tandem_core::{ArmIndex, Layout, World, WorldSettings};
 
 use crate::frame::ArmFrame;
-use crate::mico::Mico;
+use crate::mico::{Mico, hypotenuse};
 use crate::parameters::WorldParameters;
 use crate::reach::Reach;
 use crate::start::{ArmStart, all_pairs, horizontal};
@@ -212,7 +212,7 @@ impl Sampler {
     fn is_clear(&self, hand: Vector, object: Vector) -> bool {
         let gripper = self.parameters.gripper;
         let pad = gripper.pad_half;
-        let hand_m = pad.x.hypot(self.empty_opening_m() + 2.0 * pad.y);
+        let hand_m = hypotenuse(pad.x, self.empty_opening_m() + 2.0 * pad.y);
         let object_m = self.object_half_m * std::f32::consts::SQRT_2;
         hand.z >= CLEAR_HEIGHT_M || horizontal(hand - object) >= hand_m + object_m + FINGER_GAP_M
     }

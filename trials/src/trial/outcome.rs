@@ -8,7 +8,8 @@ use tandem_bridge::executor::{StartError, Stop};
 
 /// An object that rises by more than this was lifted, metres.
 const LIFTED_M: f64 = 0.03;
-/// An object farther than this from the centre of its arm's workspace, along x or y, is out of reach, metres.
+/// An object farther than this from the origin of its arm's own frame, along x or y, is out of reach, metres. In the
+/// shared world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
 const REACH_M: f64 = 0.27;
 
 /// The cause of a failed trial.

@@ -1,4 +1,4 @@
-//! Writes policies for the page, which asks for actions and never for values: their critics are zeros, which compress to
+//! Writes policies for the browser demo, which asks for actions and never for values: their critics are zeros, which compress to
 //! nothing. `actors DIR policies/student-push.safetensors ...`
 
 use std::path::PathBuf;
