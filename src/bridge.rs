@@ -76,6 +76,7 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
             speed: args.speed,
             clock,
             reconnect: arms.reconnect,
+            timings: cell.file.timings(&arms::default_settings(args.arms.driver)),
             cell: cell.file,
             cell_name: cell.name,
             injector: arms.injector,

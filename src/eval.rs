@@ -29,6 +29,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     }
     let film = PlannedFilm::of(&args.film)?;
     args.live.live.map_or(Ok(()), live::check_address)?;
+    args.record.as_deref().map_or(Ok(()), check_record)?;
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
     if args.robustness {
@@ -129,7 +130,9 @@ fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
 
 fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> Result<(), Failed> {
     if args.json {
-        return output::print(baselines.json(result));
+        let mut value = baselines.json(result);
+        value["seed"] = args.seed.into();
+        return output::print(value);
     }
     let (task, n_arms) = (result.task.name(), result.task.n_arms());
     let arms = counted(n_arms, "arm");
@@ -164,6 +167,14 @@ fn terms(subject: &EvaluatedPolicy) -> RunTerms {
     }
 }
 
+/// Checks that a log may replace what is at `path`: a file, and not a directory, a device or a pipe.
+fn check_record(path: &Path) -> Result<(), Failed> {
+    match std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
+        true => Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file"))),
+        false => Ok(()),
+    }
+}
+
 /// Writes the log of one episode of an evaluation with `seed`.
 fn record(
     subject: &EvaluatedPolicy,
@@ -172,10 +183,6 @@ fn record(
     episode: &Episode,
     path: &Path,
 ) -> Result<(), Failed> {
-    // The complete log replaces the file of its name, which must not be a device or a pipe.
-    if std::fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
-        return Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file")));
-    }
     let number = episode.number;
     let order = EpisodeOrder {
         number,

@@ -203,6 +203,7 @@ impl EvaluationResult {
 
     pub(crate) fn json(&self) -> Value {
         let contacts = ContactMetrics::of(&self.summary);
+        let reported = |rate: f64| self.task.reports_contacts().then_some(rate);
         let mut value = json!({
             "task": self.task.name(),
             "arms": self.task.n_arms(),
@@ -217,8 +218,8 @@ impl EvaluationResult {
             "success_per_arm": self.summary.success_per_arm,
             "arm_contact_rate": contacts.arm_contact_rate,
             "table_contact_rate": contacts.table_contact_rate,
-            "collision_rate": self.summary.collision_rate,
-            "collision_rate_before_success": self.summary.collision_rate_before_success,
+            "collision_rate": reported(self.summary.collision_rate),
+            "collision_rate_before_success": reported(self.summary.collision_rate_before_success),
             "lost_goal_rate": self.summary.lost_goal_rate,
             "mean_return": self.summary.mean_return,
             "steps_per_s": self.steps_per_s,
@@ -252,17 +253,19 @@ impl EvaluationResult {
             lines.push(format!("{joint}: norm of all distances"));
         }
         let arms = summary.success_per_arm.iter().enumerate().filter(|_| n_arms > 1);
-        lines.extend(arms.map(|(arm, success)| share(&format!("arm {}", arm + 1), *success)));
+        lines.extend(arms.map(|(arm, success)| share(&format!("arm {arm}"), *success)));
         let between_arms = summary.arm_contact_rate.filter(|_| n_arms > 1);
         let contacts =
             [("arm contact", between_arms), ("table contact", summary.table_contact_rate)];
         let known = contacts.into_iter().filter_map(|(label, rate)| Some(share(label, rate?)));
         lines.extend(known);
-        lines.push(format!(
-            "{}, {:.3} before success",
-            share("any contact", summary.collision_rate),
-            summary.collision_rate_before_success
-        ));
+        if self.task.reports_contacts() {
+            lines.push(format!(
+                "{}, {:.3} before success",
+                share("any contact", summary.collision_rate),
+                summary.collision_rate_before_success
+            ));
+        }
         lines.extend(summary.avoidance_rate.map(|rate| share("avoidance", rate)));
         let lost = share("lost goal", summary.lost_goal_rate);
         lines.push(format!("{lost}: achieved, not at the end"));

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
+use tandem_core::text::counted;
 use tandem_telemetry::Error;
 use tandem_telemetry::live::{Follower, Replay};
 use tokio::sync::oneshot;
@@ -16,7 +17,7 @@ use crate::{clock, output, runtime, signals};
 /// Plays `logs` to viewers until the process is asked to exit.
 pub(crate) fn serve(address: SocketAddr, logs: &[PathBuf]) -> Result<(), Failed> {
     let replay = Replay::start(address, logs, clock::since_now()).map_err(failed)?;
-    announce(replay.address(), &format!(", {} episodes; Ctrl-C ends", logs.len()));
+    announce(replay.address(), &format!(", {}; Ctrl-C ends", counted(logs.len(), "episode")));
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
         let shutdown = signals::shutdown_token(false)?;

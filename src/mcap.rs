@@ -10,8 +10,11 @@ use crate::output;
 
 pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
     let McapCommand::Recover { file, to } = &args.command;
-    let to =
-        to.clone().unwrap_or_else(|| PathBuf::from(format!("{}.recovered.mcap", file.display())));
+    let to = to.clone().unwrap_or_else(|| {
+        let mut name = file.clone().into_os_string();
+        name.push(".recovered.mcap");
+        PathBuf::from(name)
+    });
     if to.exists() {
         return Err(Failed::usage(format!(
             "{} exists: choose another file with --to",

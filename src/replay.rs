@@ -327,9 +327,9 @@ fn print_result(replayed: &[Replayed], trials: &[Replayed], json: bool) -> Resul
 fn problem_json(log: &Replayed) -> Value {
     match &log.outcome {
         Err(RecordError::Differs { step, field, component, logged, played }) => json!({
-            "file": log.file, "step": step, "field": field, "component": component, "logged": logged,
+            "file": log.file.to_string_lossy(), "step": step, "field": field, "component": component, "logged": logged,
             "played": played,
         }),
-        _ => json!({ "file": log.file, "problem": log.problem() }),
+        _ => json!({ "file": log.file.to_string_lossy(), "problem": log.problem() }),
     }
 }

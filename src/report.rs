@@ -60,8 +60,9 @@ fn print(
     if args.json {
         let mut value = export::json(comparison);
         value["trials"] = trials::json(trials);
-        value["report"] = json!(files.page);
-        value["figures"] = json!(files.plots);
+        value["report"] = json!(files.page.to_string_lossy());
+        let figures = files.plots.iter().map(|path| path.to_string_lossy());
+        value["figures"] = figures.collect();
         return output::print(value);
     }
     if !trials.groups.is_empty() {

@@ -1,11 +1,8 @@
 //! Run directories.
 
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use anyhow::anyhow;
-
-use crate::exit::{Exit, Failed};
+use crate::exit::{Failed, OrExit as _};
 use crate::run_file;
 
 /// The directory that holds the runs without `--out`.
@@ -78,11 +75,5 @@ pub(crate) fn check_path(out: &Path) -> Result<(), Failed> {
 /// Creates the directory `out` unless it exists.
 pub(crate) fn create(out: &Path) -> Result<(), Failed> {
     check_path(out)?;
-    std::fs::create_dir_all(out).map_err(|error| {
-        let exit = match error.kind() {
-            ErrorKind::InvalidFilename | ErrorKind::InvalidInput => Exit::Usage,
-            _ => Exit::TryAgain,
-        };
-        Failed::new(exit, anyhow!(error).context(format!("cannot create {}", out.display())))
-    })
+    std::fs::create_dir_all(out).or_cannot_write(|| format!("cannot create {}", out.display()))
 }

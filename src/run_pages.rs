@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use tandem_core::text::counted;
 use tandem_report::{Axis, CurveOptions, FilmStrip, Quantity, Series};
 use tandem_rl::RunConfig;
+use tandem_system::atomic_file;
 use tandem_telemetry::{MetricsLog, MetricsRow};
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -60,6 +61,7 @@ fn draw_curve(config: &RunConfig, out: &Path, rows: &[MetricsRow]) -> Result<Pat
     let options = CurveOptions::of(&title, Quantity::Success, Axis::EnvSteps);
     let svg = tandem_report::curve_svg(&[series], &options).or_exit(Exit::Bug, String::new)?;
     let path = out.join("curve.svg");
-    std::fs::write(&path, svg).or_cannot_write(|| format!("cannot write {}", path.display()))?;
+    let written = atomic_file::replace(&path, svg.as_bytes());
+    written.or_cannot_write(|| format!("cannot write {}", path.display()))?;
     Ok(path)
 }

@@ -47,8 +47,9 @@ pub(crate) fn scene(args: &SceneArgs) -> Result<(), Failed> {
         (None, Some(path)) => {
             let text =
                 input::text(path).or_exit(Exit::Usage, || format!("cannot read {path:?}"))?;
-            let actions: Vec<Actions> =
-                serde_json::from_str(&text).or_exit(Exit::Data, || format!("{path:?}"))?;
+            let actions: Vec<Actions> = serde_json::from_str(&text).or_exit(Exit::Data, || {
+                format!("{path:?} is not JSON of shape [episodes][steps][n_action]")
+            })?;
             simulate(&env, args.seed, &actions)
                 .map_err(|error| error.context(format!("{path:?}")))?
         }

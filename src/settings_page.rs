@@ -17,7 +17,7 @@ use crate::{output, run_file};
 
 const INTRODUCTION: &str = "\
 A setting is changed with `--set KEY=VALUE`, or in a run file (`--run FILE.toml`), where the part of a key before the \
-dot is a section. A recipe gives each setting its value; `--recipe` selects it. Values are those of `push` with two \
+dot is a section. A recipe gives each setting its value; `--recipe` selects it. Values are those of `shared-push` with two \
 arms, followed by those of other tasks and of one arm where they differ. A task that is not built-in has a section \
 `[description]`, which docs/environments.md describes.";
 
@@ -158,9 +158,15 @@ impl Values {
             let values: Vec<(&str, String)> =
                 kinds.iter().map(|(kind, table)| (*kind, text_at(table, key))).collect();
             let (_, usual) = &values[0];
+            // A kind is left out only if its value is that of every kind that generalizes it and is printed, or else the
+            // usual one.
             let differs = |(idx, (_, value)): &(usize, &(&str, String))| {
-                let alike = GENERALIZED_BY[*idx].iter().any(|of| values[*of].1 == *value);
-                *value != *usual && !alike
+                let general = GENERALIZED_BY[*idx].iter().map(|of| &values[*of].1);
+                let mut printed = general.filter(|of| *of != usual).peekable();
+                match printed.peek() {
+                    Some(_) => printed.any(|of| of != value),
+                    None => value != usual,
+                }
             };
             let others = values.iter().enumerate().filter(differs);
             let others = others.map(|(_, (kind, value))| format!(", {value} {kind}"));

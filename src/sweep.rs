@@ -309,7 +309,11 @@ impl<'a> Sweep<'a> {
             }
             RunOutcome::Failed(why) => {
                 self.display.ended(&name, &format!("failed: {why}"));
-                status.fail(why).or_exit(Exit::TryAgain, String::new)?;
+                // A full disk may have ended the run; the other runs go on.
+                if let Err(error) = status.fail(why) {
+                    let text = "its cause is not kept in its directory";
+                    self.display.print(&format!("{name}: {text}: {error:#}"));
+                }
             }
             RunOutcome::Interrupted => self.display.print(&format!("{name}: saved")),
         }
@@ -334,7 +338,7 @@ fn print_plan(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), F
                 json!({"name": status.run.name, "state": status.state_name(), "failure": status.failure})
             })
             .collect();
-        return output::print(json!({"out": out, "runs": runs}));
+        return output::print(json!({"out": out.to_string_lossy(), "runs": runs}));
     }
     for status in statuses {
         let failure = status.failure.as_ref();
@@ -357,7 +361,9 @@ fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(),
                 json!({"name": status.run.name, "summary": summary, "failure": status.failure})
             })
             .collect();
-        return output::print(json!({"out": out, "finished": n_finished, "runs": runs}));
+        return output::print(
+            json!({"out": out.to_string_lossy(), "finished": n_finished, "runs": runs}),
+        );
     }
     output::print(format_args!(
         "finished      {n_finished} of {} runs in {}",

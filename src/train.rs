@@ -61,7 +61,6 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
     let inputs = RunInputs::write(&plan)?;
-    summary::remove(&plan.out)?;
     drop(service_locks);
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
@@ -235,7 +234,9 @@ impl<'a> Supervisor<'a> {
         }
         self.stream = stream;
         if self.last.task.is_empty() {
-            for kept in [self.plan.keep_teacher(), self.plan.keep_environment()] {
+            // The learner has loaded its checkpoint, so the run goes on.
+            let removed = summary::remove(&self.plan.out);
+            for kept in [removed, self.plan.keep_teacher(), self.plan.keep_environment()] {
                 if let Err(failed) = kept {
                     self.display.print(&format!("{:#}", failed.into_error()));
                 }

@@ -95,6 +95,13 @@ fn one_worker_and_five_give_the_same_bits_with_the_papers_ways_of_advice_and_exp
 }
 
 #[test]
+fn one_worker_and_five_give_the_same_bits_when_a_unit_pays_for_episodes_that_ask_at_other_steps() {
+    let settings =
+        ["rounds.slots=8", "rounds.rollouts=2", "advice.share=1", "advice.unit=slot-step"];
+    check_with(("ts2c:0.2", 400), 0, &[1, 5], &settings);
+}
+
+#[test]
 #[ignore = "takes five minutes"]
 fn any_number_of_workers_gives_the_same_bits_with_every_strategy_and_either_lag() {
     for advice in STRATEGIES {

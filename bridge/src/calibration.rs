@@ -18,7 +18,7 @@ use tandem_core::ArmIndex;
 use tandem_kinematics::{Joints, WorkCell};
 
 use crate::cell_file::ArmTiming;
-use crate::driver::{Command, Driver, DriverError, Order, PairState};
+use crate::driver::{Command, Driver, DriverError, Order, PairState, SILENCE_S};
 use crate::executor::{
     BadSetting, Executor, Phase, ResetError, Settings, StartError, Stop, StopCause, Token,
 };
@@ -66,6 +66,9 @@ pub enum CalibrationError {
     /// The arms cannot be reset.
     #[error("the arms cannot be reset: {0}")]
     Reset(#[source] ResetError),
+    /// The driver has failed and did not recover.
+    #[error("the driver failed: {0}")]
+    Driver(#[source] DriverError),
     /// A joint cannot turn in either direction from where it is.
     #[error("joint {} of arm {} cannot turn by {degrees:.1} degrees from here, move the arm to where it has room: {refusal}", .joint + 1, .arm.0)]
     NoRoom {
@@ -169,6 +172,7 @@ pub fn calibrate(
         is_interrupted,
         ramp_s: settings.check.limits.ramp_s,
         at_s,
+        was_held_up: false,
     };
     let mut timings = Vec::with_capacity(cell.arms.len());
     for (arm, placed) in cell.arms.iter().enumerate() {
@@ -202,6 +206,8 @@ struct Bench<'a> {
     ramp_s: f64,
     /// The time of the last tick.
     at_s: f64,
+    /// Whether the last exchange took so long that the drives braked by themselves.
+    was_held_up: bool,
 }
 
 impl Bench<'_> {
@@ -251,7 +257,7 @@ impl Bench<'_> {
         loop {
             n += 1;
             match work(self) {
-                Err(CalibrationError::Stopped(stop)) if n < N_ATTEMPTS && was_late(&stop) => {
+                Err(CalibrationError::Stopped(stop)) if n < N_ATTEMPTS && self.was_late(&stop) => {
                     self.ready()?;
                 }
                 done => return done,
@@ -271,7 +277,20 @@ impl Bench<'_> {
         self.executor
             .acquire(OWNER, now_s)
             .map_err(|error| CalibrationError::Start(error.into()))?;
-        Ok(self.executor.tick(now_s))
+        let phase = self.executor.tick(now_s);
+        self.was_held_up = self.clock.now_s() - now_s >= SILENCE_S - self.executor.period_s();
+        Ok(phase)
+    }
+
+    /// Returns whether a machine that is too slow explains the stop. Drives that wait too long for a command report a
+    /// fault, too; any other fault needs a person.
+    fn was_late(&self, stop: &Stop) -> bool {
+        use StopCause as C;
+        match stop.cause {
+            C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_) => true,
+            C::DriveFault => self.was_held_up,
+            _ => false,
+        }
     }
 
     /// Resets the arms if they are stopped, and waits until they are at rest.
@@ -287,7 +306,12 @@ impl Bench<'_> {
                 continue;
             }
             match self.executor.reset(OWNER, now_s) {
-                Err(error) if now_s > until_s => return Err(CalibrationError::Reset(error)),
+                Err(error) if now_s > until_s => {
+                    return Err(match self.executor.exchange_error() {
+                        Some(error) => CalibrationError::Driver(error.clone()),
+                        None => CalibrationError::Reset(error),
+                    });
+                }
                 Ok(()) | Err(_) => {}
             }
         }
@@ -393,13 +417,4 @@ impl Bench<'_> {
             None => CalibrationError::Start(StartError::NoState),
         }
     }
-}
-
-/// Returns whether a machine that is too slow explains the stop.
-fn was_late(stop: &Stop) -> bool {
-    use StopCause as C;
-    matches!(
-        stop.cause,
-        C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_) | C::DriveFault
-    )
 }

@@ -353,6 +353,10 @@ impl KinovaRosDriver {
             self.arms[arm].preparation = Some(Preparation::Settling { opening, sequence, n: 0 });
             return Ok(false);
         }
+        if self.arms[arm].fingers.is_overdue() {
+            let what = format!("{} does not end", self.arms[arm].goal_topic());
+            return Err(DriverError::Refused { what });
+        }
         if self.arms[arm].fingers.busy() {
             return Ok(false);
         }

@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use crate::driver::{Command, Driver, DriverError, Order, PairState};
 use crate::quarc::codec::STATE_BYTES;
-use crate::quarc::state_buffer::StateBuffer;
+use crate::quarc::state_buffer::{StateBuffer, keep_faults};
 
 pub mod arm_side;
 pub mod codec;
@@ -213,7 +213,14 @@ impl QuarcDriver {
                 Ok(0) => return Err(closed()),
                 Ok(n) => {
                     n_taken += n;
-                    new = self.buffered.push(&buffer[..n])?.or(new);
+                    let before = new.take();
+                    new = match (self.buffered.push(&buffer[..n])?, before) {
+                        (Some(mut state), Some(before)) => {
+                            keep_faults(&mut state, &before);
+                            Some(state)
+                        }
+                        (state, before) => state.or(before),
+                    };
                 }
                 Err(error) if is_timeout(&error) => break,
                 Err(error) => return Err(lost("reading a state", &error)),

@@ -1,7 +1,7 @@
 //! The service `tandem.v1.Bridge`: a thin shell around an [`Executor`] on its own thread.
 //!
 //! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled between
-//! ticks; progress is published without waiting for readers. A stop waits in no queue.
+//! ticks; progress is published in snapshots, whose lock readers hold only to clone a pointer. A stop waits in no queue.
 //!
 //! **The drives always stop**: when the service shuts down, a stream ends or breaks, the owner falls silent, a driver
 //! fails, or the arms' thread panics. The drives of a killed process brake because they receive no commands.
@@ -32,14 +32,14 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::cell_file::CellFile;
+use crate::cell_file::{ArmTiming, CellFile};
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
 use crate::injection::Injector;
 use error::status;
 use messages::{decode_token, token_text};
 use metrics::StopCounter;
 use motion::MotionSpec;
-use thread::{ArmsHandle, ArmsThread};
+use thread::{ArmsHandle, ArmsThread, ControlLoop};
 
 pub use clock::Clock;
 pub(crate) use clock::next_time;
@@ -69,6 +69,8 @@ pub struct Config {
     pub reconnect: Option<Reconnect>,
     /// The cell file of the arms.
     pub cell: CellFile,
+    /// How fast each arm reacts: the measured times, or else those that the driver assumes.
+    pub timings: Vec<ArmTiming>,
     /// The name of the cell file; empty for the default cell.
     pub cell_name: String,
     /// Injects faults into simulated arms; `None` for real ones.
@@ -177,7 +179,8 @@ impl Bridge {
 async fn log_stops(mut snapshots: watch::Receiver<Arc<Snapshot>>, counter: StopCounter) {
     let mut logged: Option<Stop> = None;
     while snapshots.changed().await.is_ok() {
-        let stopped = snapshots.borrow_and_update().stopped.clone();
+        let newest = Arc::clone(&snapshots.borrow_and_update());
+        let stopped = newest.stopped.clone();
         if let Some(stop) = stopped.as_ref().filter(|_| stopped != logged) {
             counter.count(stop);
         }
@@ -204,13 +207,13 @@ struct BridgeService {
     /// Motions are checked one at a time, so that the arms' thread keeps a processor.
     checks: Arc<Semaphore>,
     /// One connection is replaced at a time.
-    reconnects: Semaphore,
+    reconnects: Arc<Semaphore>,
 }
 
 impl BridgeService {
     fn new(arms: ArmsHandle, config: Config) -> Self {
         let tokens = Mutex::new(ChaCha20Rng::from_seed(config.secret));
-        let (checks, reconnects) = (Arc::new(Semaphore::new(1)), Semaphore::new(1));
+        let (checks, reconnects) = (Arc::new(Semaphore::new(1)), Arc::new(Semaphore::new(1)));
         Self { arms, config, tokens, checks, reconnects }
     }
 
@@ -249,14 +252,25 @@ impl BridgeService {
 
     /// Replaces a failed driver and waits for good states. The arms do not move.
     async fn replace_driver(&self, reconnect: Reconnect, token: Token) -> Result<(), Error> {
-        let _turn = self.reconnects.acquire().await.map_err(|_closed| Error::ShuttingDown)?;
+        let turn = Arc::clone(&self.reconnects).acquire_owned().await;
+        let turn = turn.map_err(|_closed| Error::ShuttingDown)?;
         self.arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await?;
         if !self.arms.newest().exchange_failed {
             return Ok(());
         }
-        let connected = tokio::task::spawn_blocking(move || reconnect()).await;
+        // The turn ends with the connection, also if the client does not wait for it.
+        let connect = move || {
+            let _turn = turn;
+            reconnect()
+        };
+        let connected = tokio::task::spawn_blocking(connect).await;
         let driver = connected.map_err(|_panic| Error::Panicked)?.map_err(Error::Reconnect)?;
-        self.arms.run(move |arms, now_s| arms.replace_driver(token, driver, now_s)).await?;
+        let replace = move |arms: &mut ControlLoop, now_s| {
+            // Connecting may take longer than a lease. An owner who came meanwhile keeps the arms.
+            arms.executor.acquire(token, now_s)?;
+            arms.replace_driver(token, driver, now_s)
+        };
+        self.arms.run(replace).await?;
         tracing::info!("the driver was replaced");
         self.arms.wait_until(|newest| newest.exchange_failed || newest.n_good >= GOOD_STATES).await;
         Ok(())
@@ -313,7 +327,7 @@ impl BridgeService {
             driver: config.driver.clone(),
             version: config.version.clone(),
             period_s: self.arms.period_s,
-            arms: messages::describe_arms(&self.arms.checker, &config.cell),
+            arms: messages::describe_arms(cell, config),
             table_z_m: cell.table_z_m,
             task_frame: Some(messages::task_frame(cell)),
             limits: Some(messages::limits(&self.arms.checker, config.speed)),

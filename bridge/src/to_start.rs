@@ -10,7 +10,7 @@
 
 use tandem_kinematics::{ArmSample, Joints, Motion, WorkCell};
 
-use crate::driver::PairState;
+use crate::driver::{DriverError, PairState};
 use crate::executor::{
     BadSetting, CheckError, CheckedMotion, Checker, Executor, Phase, Progress, ResetError,
     Settings, StartError, Stop, Token,
@@ -56,6 +56,9 @@ pub enum ToStartError {
     /// The arms cannot be reset.
     #[error("the arms cannot be reset: {0}")]
     Reset(#[source] ResetError),
+    /// The driver has failed and did not recover.
+    #[error("the driver failed: {0}")]
+    Driver(#[source] DriverError),
     /// No order of joints and arms keeps all limits.
     #[error(
         "no checked way leads to the start, move the arms by hand or with Kinova's joystick: {0}"
@@ -155,6 +158,9 @@ impl Arms<'_> {
                 return Ok(());
             }
             if self.clock.now_s() > until_s {
+                if let Some(error) = self.executor.exchange_error() {
+                    return Err(ToStartError::Driver(error.clone()));
+                }
                 let error = match self.executor.at_rest() {
                     true => ResetError::States { got },
                     false => ResetError::Moving,

@@ -162,7 +162,7 @@ export class Player {
     if (base) group.prepend(link(at(shoulder(base, part.hand, axis)), hand));
     const gap = gapOf(part) * scale;
     group.append(...(axis === 1 ? fromAbove(hand, gap, base ? Math.sign(base[0]) : 0) : fromSide(hand, gap)));
-    group.append(svg("text", { x: hand[0], y: hand[1] - (axis === 1 ? gap + 16 : 44), "text-anchor": "middle" }, `arm ${arm + 1}`));
+    group.append(svg("text", { x: hand[0], y: hand[1] - (axis === 1 ? gap + 16 : 44), "text-anchor": "middle" }, `arm ${arm}`));
     return group;
   }
 }

@@ -82,18 +82,28 @@ function showHeader(s) {
 }
 
 function showProgress(s) {
-  const share = s.max_env_steps > 0 ? s.env_steps / s.max_env_steps
-    : s.max_minutes > 0 ? s.wall_s / (60 * s.max_minutes) : null;
-  byId("progress").hidden = share === null;
-  if (share === null) return setText(byId("progress-text"), "This run has no limit of steps or minutes.");
-  const done = Math.min(1, share);
+  const ends = [];
+  if (s.max_env_steps > 0) {
+    ends.push({
+      share: s.env_steps / s.max_env_steps, left: (s.max_env_steps - s.env_steps) / s.env_steps_per_s,
+      text: `${count(s.env_steps)} of ${count(s.max_env_steps)} environment steps`,
+    });
+  }
+  if (s.max_minutes > 0) {
+    ends.push({
+      share: s.wall_s / (60 * s.max_minutes), left: 60 * s.max_minutes - s.wall_s,
+      text: `${clock(s.wall_s)} of ${clock(60 * s.max_minutes)}`,
+    });
+  }
+  byId("progress").hidden = ends.length === 0;
+  if (ends.length === 0) return setText(byId("progress-text"), "This run has no limit of steps or minutes.");
+  const done = Math.min(1, Math.max(...ends.map((end) => end.share)));
   byId("bar").style.width = `${100 * done}%`;
   byId("progress").setAttribute("aria-valuenow", Math.round(100 * done));
-  const limit = s.max_env_steps > 0 ? `${count(s.env_steps)} of ${count(s.max_env_steps)} environment steps`
-    : `${clock(s.wall_s)} of ${clock(60 * s.max_minutes)}`;
-  const rate = s.max_env_steps > 0 ? s.env_steps_per_s : share / s.wall_s;
-  const rest = s.max_env_steps > 0 ? s.max_env_steps - s.env_steps : 1 - share;
-  const remaining = s.end || !(rate > 0) || rest <= 0 ? "" : `, about ${clock(rest / rate)} left`;
+  const limit = ends.map((end) => end.text).join(", ");
+  // The run ends at the first of its limits.
+  const left = Math.min(...ends.map((end) => end.left).filter(Number.isFinite));
+  const remaining = s.end || !(left > 0) || !Number.isFinite(left) ? "" : `, about ${clock(left)} left`;
   const end = s.end ? `. ${s.end.interrupted ? "Stopped" : "Ended"}: ${s.end.reason}` : "";
   setText(byId("progress-text"), `${limit}${remaining}${end}`);
 }
@@ -153,7 +163,7 @@ function showAdvice(s) {
   byId("advice-budget").replaceChildren(budget);
   const arms = s.acted.map((arm, idx) => {
     const steps = arm.teacher + arm.student;
-    return el("div", {}, el("p", {}, `Arm ${idx + 1}: who acted in training`), meter(arm.teacher, arm.student),
+    return el("div", {}, el("p", {}, `Arm ${idx}: who acted in training`), meter(arm.teacher, arm.student),
       pair(`teacher ${percent(arm.teacher / steps)} (${count(arm.teacher)} steps)`,
         `student ${percent(arm.student / steps)} (${count(arm.student)} steps)`));
   });

@@ -77,8 +77,10 @@ impl TeacherError {
 /// The start of a run, for the opening of its account.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RunStart {
-    /// Without a checkpoint.
+    /// A new run.
     New,
+    /// Again, because it ended before its first checkpoint.
+    Restarted,
     /// From a checkpoint.
     Resumed {
         /// Units of advice of the episodes that it has learned.
@@ -185,6 +187,11 @@ impl AdviceAccount {
         account.check_task(one_arm)?;
         match start {
             RunStart::New => account.open_account(budget, 0)?,
+            // If the teacher lost the account meanwhile, it was opened again with what was left.
+            RunStart::Restarted => match account.balance()? {
+                Some(found) => account.open_account(found.budget.min(budget), 0)?,
+                None => account.open_account(budget, 0)?,
+            },
             RunStart::Resumed { spent } => account.resume(spent)?,
         }
         let watcher = AccountWatcher::new(client, lost, (warnings.clone(), view), clock);

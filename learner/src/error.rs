@@ -30,7 +30,7 @@ pub enum Error {
     #[error(transparent)]
     Teacher(#[from] TeacherError),
     /// The run asks for advice and has no teacher.
-    #[error("strategy {0:?} needs a teacher: give its address")]
+    #[error("strategy {0:?} needs a teacher: give its address with --teacher")]
     NoTeacher(String),
     /// The run cannot start from the given teacher, or none was given.
     #[error("strategy {INIT_TEACHER:?} {0}")]

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, SlotOrder};
 use tandem_core::{AdviceUnit, Episode, EpisodeKind};
+use tandem_rl::RunConfig;
 use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
 use tokio_util::sync::CancellationToken;
@@ -57,7 +58,12 @@ pub(crate) struct Context<'a> {
 /// Runs the whole run on the calling thread.
 pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
     let initial = InitialState::load(context)?;
-    let account = match initial.open_account(context) {
+    // A complete run asks no teacher: at most evaluations are left.
+    let account = match initial.is_complete(context.config) {
+        true => Ok(None),
+        false => initial.open_account(context),
+    };
+    let account = match account {
         Err(Error::Teacher(TeacherError::Stopped)) => {
             let (round, digest) = (initial.trainer.counters().round, initial.trainer.digest());
             let reason = "interrupted".to_owned();
@@ -102,6 +108,10 @@ struct LearnerLoop<'a> {
 impl LearnerLoop<'_> {
     /// Learns round after round until a limit is reached or the run is interrupted.
     fn run_rounds(&mut self) -> Result<StopReason, Error> {
+        // A run that was interrupted while it awaited an evaluation awaits it here: its success may end the run.
+        if !self.complete_overdue_evaluations()? {
+            return Ok(StopReason::Interrupted);
+        }
         if let Some(stop) = self.stop_reason() {
             return Ok(stop);
         }
@@ -225,9 +235,7 @@ impl LearnerLoop<'_> {
 
     /// Returns true if the limit of environment steps ends the run before `round`.
     fn is_beyond_end(&self, round: u64) -> bool {
-        let run = &self.context.config.run;
-        let max = run.stop.max_env_steps;
-        max > 0 && round * run.env_steps_per_round() >= max
+        is_beyond_end(&self.context.config.run, round)
     }
 
     /// Adds slots to the queue and wakes the workers that wait for one.
@@ -385,6 +393,12 @@ impl<'a> LearnerLoop<'a> {
         };
         (&mut self.persistence, state)
     }
+}
+
+/// Returns true if a run has made its environment steps before `round`.
+fn is_beyond_end(run: &RunConfig, round: u64) -> bool {
+    let max = run.stop.max_env_steps;
+    max > 0 && round * run.env_steps_per_round() >= max
 }
 
 /// Returns the episodes that pay for advice, in their order: every advised one, or the first of each slot if a unit

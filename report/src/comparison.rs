@@ -37,7 +37,7 @@ pub struct FilmStrip {
 /// Explains the paper's measures.
 pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: epochs from there to 90 % of it. MSR: maximum \
      success. ELR: 90 % of MSR per epoch until it was reached. IE, RT and ELR are – if MSR is below 0.5 or a run has fewer \
-     than 5 evaluations. An epoch is 50 rounds.";
+     than 5 evaluations. An epoch is `rounds.per_epoch` rounds, 50 by default.";
 
 /// The runs of one task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -166,7 +166,7 @@ impl Section {
     /// Returns the measures of the paper's Table 2.
     fn measures(&self) -> Table {
         let title =
-            format!("{}: measures of the paper's Table 2, epochs of 50 rounds", self.setup.title());
+            format!("{}: measures of the paper's Table 2, in its epochs", self.setup.title());
         let mut table = Table::new(title, &["strategy", "runs", "IE", "RT", "MSR", "ELR"]);
         for group in &self.groups {
             table.rows.push(vec![
@@ -287,7 +287,7 @@ fn cost_title(section: &Section, measure: Quantity) -> String {
         Quantity::SuccessWithoutContact => "success without contact",
         _ => "success",
     };
-    format!("{}: cost of a {of_what} in an evaluation", section.setup.title())
+    format!("{}: cost of reaching a rate of {of_what}", section.setup.title())
 }
 
 /// Returns the number of steps on which the teacher was asked.
@@ -384,7 +384,7 @@ mod tests {
             configuration: Some(format!(
                 "task = \"{task}\"\narms = 2\nseed = {seed}\n[advice]\nstrategy = \"{strategy}\""
             )),
-            test: None,
+            ..Run::default()
         }
     }
 
@@ -454,7 +454,7 @@ mod tests {
             "40k; 60k; –; 3.0; 4.5; –; 30k; 12k; 24k; 12k; 24k"
         );
         let text = comparison.text();
-        assert!(text.contains("cost of a success without contact in an evaluation"), "{text}");
+        assert!(text.contains("cost of reaching a rate of success without contact"), "{text}");
         let plots = comparison_plots(&comparison).expect("drawn");
         let names: Vec<&str> = plots.all().map(|plot| plot.file_name.as_str()).collect();
         let name = "shared-push-2-success-without-contact-environment-steps-strategies.svg";

@@ -185,12 +185,13 @@ pub(crate) struct Drawing {
 /// # Errors
 /// If the plotting library fails.
 pub(crate) fn curve_drawing(series: &[Series], options: CurveOptions) -> Result<Drawing, Error> {
-    let wide = curve_svg(series, &options)?;
-    let mut narrow = options.narrow();
-    // A legend with many lines would leave no room for the curves.
-    let legend_px = LEGEND_LINE_PX * n_legend_lines(&legend(series, narrow.width));
-    narrow.height += legend_px.unsigned_abs();
-    Ok(Drawing { wide, narrow: curve_svg(series, &narrow)? })
+    // A legend with many lines would leave no room for the curves; a wide drawing has room for two.
+    let legend_px = |width| LEGEND_LINE_PX * n_legend_lines(&legend(series, width));
+    let more_px = (legend_px(options.width) - 2 * LEGEND_LINE_PX).max(0);
+    let mut narrow = options.clone().narrow();
+    narrow.height += legend_px(narrow.width).unsigned_abs();
+    let wide = CurveOptions { height: options.height + more_px.unsigned_abs(), ..options };
+    Ok(Drawing { wide: curve_svg(series, &wide)?, narrow: curve_svg(series, &narrow)? })
 }
 
 /// Draws `series` with their bands and a legend as SVG.

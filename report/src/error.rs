@@ -32,7 +32,7 @@ pub enum Error {
         problem: String,
     },
     /// A metrics file contains no row.
-    #[error("no metrics rows in {path:?}: its first line is not one")]
+    #[error("no metrics rows in {path:?}: it is empty, or its first line is not one")]
     NoMetrics {
         /// Path of the file.
         path: PathBuf,

@@ -81,7 +81,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
 
 /// Quotes a cell if CSV requires it.
 fn quoted(cell: &str) -> String {
-    match cell.contains([',', '"', '\n']) {
+    match cell.contains([',', '"', '\n', '\r']) {
         true => format!("\"{}\"", cell.replace('"', "\"\"")),
         false => cell.to_owned(),
     }
@@ -206,7 +206,7 @@ mod tests {
             configuration: Some(
                 "task = \"push\"\narms = 2\nseed = 3\n[advice]\nstrategy = \"ea\"".to_owned(),
             ),
-            test: None,
+            ..Run::default()
         };
         Comparison::of(
             vec![run, Run { name: "push-empty-seed1".to_owned(), ..Run::default() }],

@@ -388,7 +388,7 @@ mod tests {
             name: name.to_owned(),
             rows: (1..).zip(successes).map(row).collect(),
             configuration: (!settings.is_empty()).then(|| settings.to_owned()),
-            test: None,
+            ..Run::default()
         }
     }
 

@@ -125,6 +125,8 @@ fn figure_grid<'a>(svgs: impl Iterator<Item = (&'a str, &'a str)>) -> String {
 
 /// Escapes text for HTML and SVG.
 pub(crate) fn escaped(text: &str) -> String {
+    // XML knows no control characters but these.
+    let text = text.replace(|c: char| c.is_control() && !"\t\n\r".contains(c), "\u{fffd}");
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

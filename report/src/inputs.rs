@@ -1,5 +1,6 @@
 //! Finds and reads the runs and trials of a report.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use tandem_telemetry::TrialRow;
@@ -21,6 +22,8 @@ pub struct ReportInputs {
     pub trials: Vec<TrialRow>,
     /// One line for each file that is ignored in part or as a whole.
     pub warnings: Vec<String>,
+    /// The canonical paths of the runs and files that were read.
+    read: BTreeSet<PathBuf>,
 }
 
 impl ReportInputs {
@@ -34,13 +37,23 @@ impl ReportInputs {
     pub fn load(paths: &[PathBuf]) -> Result<Self, Error> {
         let mut inputs = Self::default();
         for path in paths {
-            if path.is_file() {
-                inputs.read_file(path)?;
-            } else {
+            if path.is_dir() {
                 inputs.read_directory(path)?;
+            } else if inputs.is_new(path) {
+                inputs.read_file(path)?;
             }
         }
         Ok(inputs)
+    }
+
+    /// Returns true if the run or file `path` was not read before: it counts once, however often it is named.
+    fn is_new(&mut self, path: &Path) -> bool {
+        let Ok(canonical) = path.canonicalize() else { return true };
+        let is_new = self.read.insert(canonical);
+        if !is_new {
+            self.warnings.push(format!("{} is named twice and counted once", path.display()));
+        }
+        is_new
     }
 
     fn read_file(&mut self, path: &Path) -> Result<(), Error> {
@@ -61,6 +74,9 @@ impl ReportInputs {
         let mut first_error = None;
         let n_before = self.runs.len() + self.trials.len();
         for dir in &found.run_dirs {
+            if !self.is_new(dir) {
+                continue;
+            }
             match Run::load(dir, &mut self.warnings) {
                 Ok(run) => self.runs.push(run),
                 Err(error) => {

@@ -163,7 +163,14 @@ impl PaperRow {
 pub(crate) fn split_strategy(strategy: &str) -> (&str, Option<f64>) {
     match strategy.split_once(':') {
         Some((name, threshold)) => (name, threshold.parse().ok()),
-        None => (strategy, (!matches!(strategy, "none" | "ea")).then_some(0.1)),
+        None => {
+            let usual = match strategy {
+                "none" | "ea" => None,
+                "jsrl" => Some(20.0),
+                _ => Some(0.1),
+            };
+            (strategy, usual)
+        }
     }
 }
 

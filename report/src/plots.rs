@@ -305,7 +305,7 @@ mod tests {
             configuration: Some(format!(
                 "task = \"push\"\narms = 2\nseed = {seed}\ncopy = \"{name}\"\n[advice]\nstrategy = \"{strategy}\""
             )),
-            test: None,
+            ..Run::default()
         }
     }
 

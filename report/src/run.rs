@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
+use sha2::{Digest as _, Sha256};
 use tandem_core::task::TaskDescription;
+use tandem_core::text::hex;
 use tandem_core::{Layout, Task, TaskSpec};
 use tandem_telemetry::MetricsRow;
 use toml::{Table, Value};
@@ -22,6 +24,8 @@ pub struct Run {
     pub configuration: Option<String>,
     /// Evaluation of the best policy on test goals, from `summary.json`, if there is one.
     pub test: Option<TestEvaluation>,
+    /// SHA-256 of the teacher's file in the run directory, the first digits, hexadecimal, if there is one.
+    pub teacher: Option<String>,
 }
 
 impl Run {
@@ -42,7 +46,7 @@ impl Run {
                 .flatten(),
             false => None,
         };
-        Ok(Self { name: directory_name(dir), rows, configuration, test })
+        Ok(Self { name: directory_name(dir), rows, configuration, test, teacher: teacher_of(dir) })
     }
 
     /// Reads a metrics file without a run directory.
@@ -73,9 +77,15 @@ impl Run {
         self.rows.last()
     }
 
-    /// Returns the configuration as a table, which is empty if there is none.
+    /// Returns the configuration as a table, which is empty if there is none, with the digest of the teacher, which the
+    /// configuration does not name.
     pub(crate) fn settings(&self) -> Table {
-        self.configuration.as_ref().and_then(|text| text.parse().ok()).unwrap_or_default()
+        let settings = self.configuration.as_ref().and_then(|text| text.parse::<Table>().ok());
+        let mut settings = settings.unwrap_or_default();
+        if let Some(teacher) = self.teacher.as_ref().filter(|_| !settings.is_empty()) {
+            settings.insert("teacher".to_owned(), Value::String(teacher.clone()));
+        }
+        settings
     }
 
     /// Returns the name of the task, from the configuration or, for a built-in task, else from the run's name.
@@ -141,6 +151,13 @@ fn read_metrics(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<MetricsRo
 fn directory_name(dir: &Path) -> String {
     let absolute = dir.canonicalize().unwrap_or_else(|_| dir.to_owned());
     absolute.file_name().unwrap_or(dir.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Returns the first digits of the SHA-256 of the teacher's file in the run directory `dir`.
+fn teacher_of(dir: &Path) -> Option<String> {
+    const FILES: [&str; 3] = ["teacher.safetensors", "teacher.onnx", "teacher.toml"];
+    let bytes = FILES.iter().find_map(|file| std::fs::read(dir.join("policy").join(file)).ok())?;
+    Some(hex(&Sha256::digest(bytes)[..4]))
 }
 
 #[cfg(test)]

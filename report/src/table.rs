@@ -26,6 +26,11 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
+/// Escapes a cell for Markdown: its text is that of a user's directory.
+fn in_markdown(cell: &str) -> String {
+    cell.replace('|', "\\|").replace('<', "&lt;").replace(['\n', '\r'], " ")
+}
+
 impl Table {
     /// Creates a table without rows.
     pub(crate) fn new(title: String, header: &[&str]) -> Self {
@@ -59,7 +64,7 @@ impl Table {
     #[must_use]
     pub fn markdown(&self) -> String {
         let line = |cells: &[String]| {
-            let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+            let cells: Vec<String> = cells.iter().map(|cell| in_markdown(cell)).collect();
             format!("| {} |\n", cells.join(" | "))
         };
         let alignments: String = (0..self.header.len())

@@ -61,8 +61,10 @@ impl TestEvaluation {
     }
 
     fn of(object: &Value) -> Result<Self, String> {
-        let number =
-            |key: &str| object[key].as_f64().ok_or_else(|| format!("{key:?} is not a number"));
+        let number = |key: &str| {
+            let share = object[key].as_f64().filter(|share| (0.0..=1.0).contains(share));
+            share.ok_or_else(|| format!("{key:?} is not a share from 0 to 1"))
+        };
         let count =
             |key: &str| object[key].as_u64().ok_or_else(|| format!("{key:?} is not a count"));
         let task = object["task"].as_str().ok_or("\"task\" is not a name")?;
@@ -73,7 +75,11 @@ impl TestEvaluation {
             success: number("success")?,
             interval: (number("success_low")?, number("success_high")?),
             success_joint: number("success_joint")?,
-            collision_rate: number("collision_rate")?,
+            collision_rate: match object.get("collision_rate") {
+                // Of a task that reports no contacts.
+                Some(Value::Null) => 0.0,
+                _ => number("collision_rate")?,
+            },
             contacts: serde_json::from_value(object.clone())
                 .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
         })

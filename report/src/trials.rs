@@ -187,7 +187,8 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
 /// Draws a trial. `names` counts the uses of each file name, so that every plot gets its own.
 fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
     let TrialRow { task, policy, mode, seed, trial, .. } = row;
-    let stem = slug(&format!("trial-{task}-{policy}-{mode}-seed{seed}-{trial}"));
+    let policy_part: String = slug(policy).chars().take(MAX_NAME_PART).collect();
+    let stem = slug(&format!("trial-{task}-{policy_part}-{mode}-seed{seed}-{trial}"));
     let n_uses = names.entry(stem.clone()).or_insert(0);
     *n_uses += 1;
     let file_name = match *n_uses {
@@ -198,6 +199,9 @@ fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
     let Drawing { wide, narrow } = plot::trial_drawing(row);
     Plot { file_name, title, svg: wide, narrow_svg: narrow }
 }
+
+/// Largest number of characters of a policy's name in the name of a file.
+const MAX_NAME_PART: usize = 100;
 
 /// Returns a name that is valid on every file system.
 fn slug(text: &str) -> String {

@@ -29,6 +29,9 @@ const TIMEOUT: Duration = Duration::from_secs(600);
 const OTHER_DESCRIPTORS: u64 = 100;
 
 pub(super) fn scale(args: &ScaleArgs) -> Result<Scale, Failed> {
+    if args.idle == 0 && args.workers.iter().all(|n_workers| *n_workers == 0) {
+        return Err(Failed::usage("--workers 0 and --idle 0 leave nothing to measure"));
+    }
     let n_joining = join_leave(args)?;
     let updates = args.updates_per_env_step;
     if !(0.0..=100.0).contains(&updates) {

@@ -6,6 +6,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use tandem_kinematics::{ArmWaypoint, Waypoint};
 use tandem_proto::pb;
+use tandem_system::atomic_file;
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
@@ -65,7 +66,8 @@ pub(super) fn write(path: &Path, speed: f64, waypoints: &[Waypoint]) -> Result<(
     let waypoints: Vec<Vec<Value>> =
         waypoints.iter().map(|arms| arms.iter().map(arm).collect()).collect();
     let text = json!({ "speed": speed, "way_points": waypoints }).to_string();
-    std::fs::write(path, text + "\n").or_cannot_write(|| format!("cannot write {}", path.display()))
+    let written = atomic_file::replace(path, (text + "\n").as_bytes());
+    written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 /// Reads the motion file `path`; `speed` overrides the speed in the file.

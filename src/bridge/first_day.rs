@@ -2,6 +2,8 @@
 
 use std::io::{BufRead as _, IsTerminal as _};
 use std::sync::Arc;
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::Duration;
 
 use anyhow::anyhow;
 use serde_json::json;
@@ -42,7 +44,7 @@ pub(super) fn home(args: HomeArgs) -> Result<(), Failed> {
                 "{name}: its node moves the arm along a path of its own and opens the gripper; only the emergency stop \
                  ends it. Nothing is near the arm or in its gripper"
             );
-            confirm(args.confirmation.yes, &question, name)?;
+            confirm(args.confirmation.yes, &question, name, interrupted)?;
             output::message(format_args!("tandem: homing {name}"));
             home_arm(&config, arm, interrupted).map_err(|error| homing_failed(name, &error))?;
             homed.push(name.clone());
@@ -92,7 +94,8 @@ pub(super) fn to_start(args: ToStartArgs) -> Result<(), Failed> {
         cell.require_places()?;
         let question = "Both arms move slowly to their start posture. Somebody watches them with a hand on the \
                         emergency stop, and nothing stands in their way";
-        confirm(args.confirmation.yes, question, "yes")?;
+        // Nothing handles Ctrl-C yet, so that it ends the process.
+        confirm(args.confirmation.yes, question, "yes", &CancellationToken::new())?;
     }
     let json = args.confirmation.json;
     block_on(move |interrupted| move_arms(&args, &cell, interrupted))?;
@@ -164,7 +167,12 @@ fn block_on<T: Send + 'static>(
 }
 
 /// Asks the operator to type `answer`, unless that was done on the command line.
-fn confirm(is_given: bool, question: &str, answer: &str) -> Result<(), Failed> {
+fn confirm(
+    is_given: bool,
+    question: &str,
+    answer: &str,
+    interrupted: &CancellationToken,
+) -> Result<(), Failed> {
     if is_given {
         return Ok(());
     }
@@ -172,8 +180,30 @@ fn confirm(is_given: bool, question: &str, answer: &str) -> Result<(), Failed> {
         return Err(Failed::usage(format!("{question}: confirm with --yes")));
     }
     output::message(format_args!("{question}.\nType {answer:?} to begin:"));
-    let mut line = String::new();
-    let read = std::io::stdin().lock().read_line(&mut line);
-    read.or_exit(Exit::TryAgain, || "cannot read the answer".to_owned())?;
+    let line = read_line(interrupted)?;
+    let line = line.or_exit(Exit::TryAgain, || "cannot read the answer".to_owned())?;
     if line.trim() == answer { Ok(()) } else { Err(Failed::usage("not confirmed: nothing moved")) }
+}
+
+/// Reads a line that the operator types. Returns an error once `interrupted` is cancelled.
+fn read_line(interrupted: &CancellationToken) -> Result<std::io::Result<String>, Failed> {
+    let (sender, lines) = mpsc::sync_channel(1);
+    // Nothing interrupts a read, so another thread reads. It ends with the process.
+    std::thread::spawn(move || {
+        let mut line = String::new();
+        let read = std::io::stdin().lock().read_line(&mut line);
+        sender.send(read.map(|_n_bytes| line)).ok();
+    });
+    loop {
+        match lines.recv_timeout(Duration::from_millis(50)) {
+            Ok(read) => return Ok(read),
+            Err(RecvTimeoutError::Disconnected) => return Ok(Ok(String::new())),
+            Err(RecvTimeoutError::Timeout) if interrupted.is_cancelled() => {
+                let nothing_moves = "interrupted: nothing moves";
+                output::message(format_args!("tandem: {nothing_moves}"));
+                return Err(Failed::new(Exit::Interrupted, anyhow!(nothing_moves)));
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+        }
+    }
 }

@@ -40,6 +40,12 @@ pub(super) async fn call_with_timeout<T>(
     within(TIMEOUT, call).await?.map_err(|status| failed(&status))
 }
 
+/// Stops the arms, or reports after [`STOP_TIMEOUT`] that the bridge has not confirmed it.
+pub(super) async fn stop_arms(client: &mut Client) -> Result<pb::StopResponse, Failed> {
+    let answer = within(STOP_TIMEOUT, client.stop(pb::StopRequest {})).await?;
+    answer.map_err(|status| failed(&status))
+}
+
 /// Runs a call for at most `timeout`. Returns its response or status.
 async fn within<T>(
     timeout: Duration,

@@ -11,7 +11,9 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status, Streaming};
 
-use super::operator::{Client, acquire, call_with_timeout, failed, release, with_client};
+use super::operator::{
+    Client, acquire, call_with_timeout, failed, release, stop_arms, with_client,
+};
 use super::{file, show};
 use crate::cli::MoveArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -155,8 +157,10 @@ async fn watch(
                 return Err(interrupt(client).await);
             }
         };
-        let next =
-            next.or_exit(Exit::TryAgain, || "the bridge sends no more reports".to_owned())?;
+        let Ok(next) = next else {
+            display.close();
+            return Err(stop_silent(client).await);
+        };
         let Some(next) = next.map_err(|status| stream_failed(&status))? else {
             let what = anyhow::anyhow!("the bridge did not report how the motion ended");
             return Err(Failed::new(Exit::TryAgain, what));
@@ -172,7 +176,7 @@ async fn watch(
 
 /// Stops the arms and reports whether the bridge received the command.
 async fn interrupt(client: &mut Client) -> Failed {
-    match call_with_timeout(client.stop(pb::StopRequest {})).await {
+    match stop_arms(client).await {
         Ok(_) => output::message("tandem: interrupted: the arms are stopped"),
         Err(failed) => output::message(format_args!(
             "tandem: interrupted, and the arms could NOT be stopped, use the emergency stop: {:#}",
@@ -180,6 +184,20 @@ async fn interrupt(client: &mut Client) -> Failed {
         )),
     }
     Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted"))
+}
+
+/// Stops the arms of a bridge that sends no more reports, and returns what is known about them.
+async fn stop_silent(client: &mut Client) -> Failed {
+    let what = match stop_arms(client).await {
+        Ok(_) => {
+            "the bridge sent no more reports, and the arms were stopped: inspect them".to_owned()
+        }
+        Err(failed) => format!(
+            "the bridge sends no more reports and does not confirm a stop, use the emergency stop: {:#}",
+            failed.into_error()
+        ),
+    };
+    Failed::new(Exit::TryAgain, anyhow::anyhow!(what))
 }
 
 /// Sends keep-alive messages until the stream is closed.

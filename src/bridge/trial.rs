@@ -1,7 +1,9 @@
 //! `tandem bridge trial`: runs policies on the simulated pair.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use clap::ValueEnum as _;
 use indicatif::ProgressBar;
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
@@ -49,6 +51,13 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let gripper = GripperConfig { pad_friction: args.pad_friction, ..GripperConfig::default() };
     let all_modes = [ModeName::ClosedLoop, ModeName::Twin, ModeName::OpenLoop];
     let modes = if args.modes.is_empty() { &all_modes[..] } else { &args.modes };
+    if let Some(mode) =
+        modes.iter().enumerate().find_map(|(idx, mode)| modes[..idx].contains(mode).then_some(mode))
+    {
+        let name =
+            mode.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
+        return Err(Failed::usage(format!("--mode {name} is given twice")));
+    }
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
     create_directory(&out)?;
     if args.motions {
@@ -120,6 +129,13 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
             )));
         }
         policies.push(NamedPolicy { name: format!("composed-{}", name_of(path)), policy });
+    }
+    let mut names = BTreeSet::new();
+    if let Some(again) = policies.iter().find(|named| !names.insert(&named.name)) {
+        return Err(Failed::usage(format!(
+            "two policies are called {:?}, after their files or run directories: copy one to a file of another name",
+            again.name
+        )));
     }
     let own_task = |named: &NamedPolicy| {
         let built_in = named.policy.layout.as_built_in().map(|layout| layout.task);
@@ -243,8 +259,8 @@ fn show(args: &TrialArgs, rows: Vec<TrialRow>, file: &Path) -> Result<(), Failed
         .or_cannot_write(String::new)?;
     if args.json {
         let mut value = json!({ "trials": tandem_report::trials::json(&trials) });
-        value["file"] = json!(file);
-        value["report"] = json!(written.page);
+        value["file"] = json!(file.to_string_lossy());
+        value["report"] = json!(written.page.to_string_lossy());
         output::print(value)?;
         return Ok(());
     }

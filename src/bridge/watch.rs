@@ -277,7 +277,7 @@ fn page_access(
 fn metadata(args: &BridgeServeArgs, file: &Cell) -> BTreeMap<String, String> {
     let cell = file.file.work_cell();
     let settings = file.settings(args.arms.driver);
-    let timings = file.file.timings(&settings);
+    let timings = file.file.timings(&arms::default_settings(args.arms.driver));
     let mut metadata = BTreeMap::new();
     let mut add = |key: &str, value: String| drop(metadata.insert(key.to_owned(), value));
     add("driver", arms::name(args.arms.driver).to_owned());

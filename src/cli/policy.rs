@@ -80,7 +80,7 @@ pub(crate) struct ImportArgs {
     /// ONNX model of the critic. Without it, the policy has no values.
     #[arg(long, value_name = "FILE.onnx")]
     pub(crate) critic: Option<PathBuf>,
-    /// Task [default: the one in the model's metadata, or the only one that the model fits].
+    /// Task [default: the one in the model's metadata, or the one of the classic world that the model fits].
     #[arg(long, value_parser = TaskName::parser(), requires = "arms")]
     pub(crate) task: Option<TaskName>,
     /// World of the task [default: shared].

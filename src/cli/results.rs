@@ -35,7 +35,7 @@ pub(crate) struct EvalArgs {
     /// other.
     #[arg(long, requires = "policy")]
     pub(crate) baselines: bool,
-    /// Evaluates on the same starts and goals under conditions that the policy was not trained for, one at a time: other
+    /// Evaluates on the same starts and goals under conditions that differ from the usual ones, one at a time: other
     /// sizes and masses of the cubes, other friction, noise in the positions of the objects, late actions, and bases that
     /// are not where they are believed to be.
     #[arg(long, requires = "policy", conflicts_with_all = [
@@ -133,7 +133,8 @@ pub(crate) struct ReportArgs {
     #[arg(required = true, value_name = "DIR|FILE")]
     pub(crate) paths: Vec<PathBuf>,
     /// HTML page; its figures are also written to a directory beside it, report-figures for report.html [default:
-    /// report.html in the directory of the sweep or trials, or comparison.html in that of a run, if it is the only one].
+    /// report.html in the directory of the sweep or trials, or comparison.html in that of a run, if it is the only one,
+    /// else report.html in the working directory].
     #[arg(long, value_name = "FILE.html")]
     pub(crate) out: Option<PathBuf>,
     /// Also writes a CSV file with one line per run.
@@ -172,7 +173,8 @@ Examples:
 All numbers from the simulator are compared bit for bit with the log. An episode of a task that is \
 not built-in is simulated again in the environments of --env or --env-command. Logs of trials are \
 left out. The exit code is 65 if \
-a number differs or a log cannot be read, and else 64 if a log needs environments that are not given.")]
+a number differs or a log cannot be read, and else 64 if a log needs environments that are not given; \
+a single log is then printed without --verify, and not compared.")]
 pub(crate) struct ReplayArgs {
     /// Recorded episodes, or directories to search for *.mcap files.
     #[arg(required = true, value_name = "FILE|DIR")]
@@ -234,7 +236,7 @@ pub(crate) struct PictureArgs {
     /// One-arm policy that controls both arms.
     #[arg(long, value_name = "FILE", conflicts_with = "policy")]
     pub(crate) composed_teachers: Option<PathBuf>,
-    /// Number of the episode, which determines start and goal.
+    /// Seed of start and goal: those of the first episode of an evaluation with this seed.
     #[arg(long, default_value_t = TEST_SEED)]
     pub(crate) seed: u64,
     /// Control step to draw, 0 to 50.

@@ -57,7 +57,7 @@ pub(crate) struct TrainArgs {
     /// first H steps), rlif:T (as mc-q:T, and interventions lower the reward) or ts2c:T (asks
     /// where critics disagree). With init:teacher the student starts as
     /// copies of the teacher and gets no advice
-    /// [default: mc-q:0.4 in pick-and-place and mc-q:0.1 in other tasks of two arms, none with one].
+    /// [default: none with one arm; mc-q:0.4 in pick-and-place of world shared with recipe tandem, else mc-q:0.1].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
     /// Policy file of the teacher, the ONNX model of an actor (*.onnx), or http://HOST:PORT of a server of

@@ -24,6 +24,9 @@ impl Baselines {
         if !args.baselines {
             return Ok(Self::none());
         }
+        let EvaluatedPolicy::Policy(policy) = subject else {
+            return Err(Failed::usage("--baselines needs --policy"));
+        };
         let layout = subject.layout();
         if layout.n_arms < 2 {
             return Err(Failed::usage(
@@ -45,7 +48,7 @@ impl Baselines {
                 layout.task
             )));
         }
-        let blind = EvaluatedPolicy::Blind(subject.policy().clone());
+        let blind = EvaluatedPolicy::Blind(policy.clone());
         let subjects = [("composed teachers", composed), ("blind policy", blind)];
         let results = subjects
             .into_iter()

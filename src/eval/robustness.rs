@@ -94,7 +94,7 @@ fn conditions(task: Task) -> Vec<Condition> {
         world: default(),
         perturbation,
     };
-    let mut conditions = vec![in_world("as trained", default())];
+    let mut conditions = vec![in_world("none", default())];
     // The bar has a size and a mass of its own.
     if !task.shares_object() {
         conditions.extend([0.040, 0.055, 0.070, 0.090].map(|edge_m| {

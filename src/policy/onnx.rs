@@ -43,7 +43,7 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
         written.push((role, path, model.digest));
     }
     if args.json {
-        let file = |(role, path, digest): &(&str, &std::path::PathBuf, String)| json!({ "role": role, "file": path, "digest": digest });
+        let file = |(role, path, digest): &(&str, &std::path::PathBuf, String)| json!({ "role": role, "file": path.to_string_lossy(), "digest": digest });
         let files: Vec<_> = written.iter().map(file).collect();
         return output::print(json!({ "policy_digest": policy.digest(), "files": files }));
     }
@@ -84,7 +84,7 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     policy.save(&args.out).or_cannot_write(String::new)?;
     if args.json {
         return output::print(json!({
-            "file": args.out, "task": layout.task.name(), "arms": layout.n_arms, "digest": policy.digest(),
+            "file": args.out.to_string_lossy(), "task": layout.task.name(), "arms": layout.n_arms, "digest": policy.digest(),
             "has_critic": policy.has_critic(), "action_difference": differences[0], "value_difference": differences[1],
         }));
     }

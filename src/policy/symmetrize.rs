@@ -24,7 +24,7 @@ pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     let (n_layers, n_hidden) = (policy.n_hidden_layers, policy.n_hidden);
     if args.json {
         return output::print(json!({
-            "file": args.out, "digest": policy.digest(), "n_hidden": n_hidden, "n_hidden_layers": n_layers,
+            "file": args.out.to_string_lossy(), "digest": policy.digest(), "n_hidden": n_hidden, "n_hidden_layers": n_layers,
         }));
     }
     output::print(format_args!("policy        {}", args.out.display()))?;

@@ -154,7 +154,11 @@ pub(super) fn learner_failed(error: Error) -> Failed {
         | Error::NoTeacher(_)
         | Error::Teacher(_)
         | Error::StartFrom(_)
-        | Error::Checkpoint(CheckpointError::OtherSettings { .. }) => Exit::Usage,
+        | Error::Checkpoint(
+            CheckpointError::OtherSettings { .. }
+            | CheckpointError::RunExists(_)
+            | CheckpointError::Config(_),
+        ) => Exit::Usage,
         Error::Checkpoint(_) => Exit::Data,
         Error::RunDirectory { .. } | Error::Serve(_) => Exit::TryAgain,
         Error::ServerConfig(_) | Error::Address(_) => Exit::Usage,

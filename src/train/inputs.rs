@@ -4,6 +4,8 @@
 
 use std::path::{Path, PathBuf};
 
+use tandem_system::atomic_file;
+
 use super::plan::Plan;
 use super::teacher_file::TeacherFile;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -22,7 +24,8 @@ impl RunInputs {
         let failed = || format!("cannot write to {}", plan.out.display());
         std::fs::create_dir_all(&inputs.directory).or_exit(Exit::TryAgain, failed)?;
         let text = run_file::to_text(&plan.config)?;
-        std::fs::write(settings(&plan.out), text).or_exit(Exit::TryAgain, failed)?;
+        atomic_file::replace(&settings(&plan.out), text.as_bytes())
+            .or_exit(Exit::TryAgain, failed)?;
         if let Some(teacher) = &plan.teacher {
             let written = teacher.write_to(&inputs.directory);
             written.map_err(|failure| failure.context(failed()))?;

@@ -73,7 +73,10 @@ impl RestartPolicy {
             }
             _ => (),
         }
-        self.n_failed_starts = if uptime < MIN_UPTIME { self.n_failed_starts + 1 } else { 0 };
+        // A learner ends with 75 if its last state cannot be written: to learn it again does not help.
+        let is_futile = (self.role, end) == (Role::Learner, ProcessEnd::Code(75));
+        self.n_failed_starts =
+            if uptime < MIN_UPTIME || is_futile { self.n_failed_starts + 1 } else { 0 };
         match self.n_failed_starts {
             n_times @ MAX_FAILED_STARTS.. => Decision::GiveUp { n_times },
             0 | 1 => Decision::Restart { after: Duration::ZERO },
@@ -144,5 +147,7 @@ mod tests {
         let mut ends = vec![(KILLED, 9); 4];
         ends.extend([(KILLED, 10), (KILLED, 1)]);
         assert_eq!(decisions(Role::Learner, &ends)[4..], [AT_ONCE, AT_ONCE]);
+        let full_disk = [(ProcessEnd::Code(75), 3600); 5];
+        assert_eq!(decisions(Role::Learner, &full_disk)[4], given_up);
     }
 }

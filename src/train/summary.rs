@@ -106,9 +106,10 @@ fn summary_lines(
     ));
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.push(format!(
-        "training      {} env steps, {} updates, {} round{} in {}",
+        "training      {} env steps, {} update{}, {} round{} in {}",
         grouped(last.env_steps),
         grouped(last.updates),
+        if last.updates == 1 { "" } else { "s" },
         grouped(last.round),
         if last.round == 1 { "" } else { "s" },
         clock_text(last.wall_s)

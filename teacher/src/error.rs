@@ -16,7 +16,7 @@ pub enum Error {
     Policy(#[from] tandem_policy::Error),
     /// The policy is not for one arm with one value.
     #[error(
-        "a teacher needs a policy for 1 arm with 1 value, this one is for {n_arms} with {n_values}"
+        "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives {n_arms} and returns {n_values}"
     )]
     NotOneArm {
         /// The number of arms of the policy.

@@ -256,7 +256,7 @@ mod tests {
         let refusal = OneArmPolicy::new(&policy(2, 1, 0.5)).err().unwrap().to_string();
         assert_eq!(
             refusal,
-            "a teacher needs a policy for 1 arm with 1 value, this one is for 2 with 1"
+            "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives 2 and returns 1"
         );
         assert!(OneArmPolicy::new(&policy(1, 2, 0.5)).is_err());
     }

@@ -24,6 +24,12 @@ pub enum Error {
         /// The cause.
         source: mcap::McapError,
     },
+    /// Another writer has the log.
+    #[error("{path:?} is being written by another process")]
+    LogInUse {
+        /// Path of the log.
+        path: PathBuf,
+    },
     /// The file is not an MCAP file, or it is incomplete or damaged.
     #[error(
         "{path:?} is not a complete MCAP file; `tandem mcap recover` recovers the log of a killed writer"
@@ -132,6 +138,10 @@ impl Error {
 
     /// Returns a function for `map_err` on reading a log.
     pub(crate) fn read_log(path: &Path) -> impl FnOnce(mcap::McapError) -> Self {
-        move |source| Self::ReadLog { path: path.to_owned(), source }
+        let path = path.to_owned();
+        move |source| match source {
+            mcap::McapError::BadMagic => Self::NotMcap { path },
+            source => Self::ReadLog { path, source },
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! An MCAP file while it is written: its names, options and channels.
 
 use std::collections::BTreeMap;
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io::BufWriter;
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
@@ -25,10 +25,17 @@ pub(crate) struct LogFile {
 }
 
 impl LogFile {
-    /// Creates the file that will be named `path`. An incomplete file of that name is overwritten.
+    /// Creates the file that will be named `path`. An incomplete file of that name is overwritten, unless another writer
+    /// still has it.
     pub(crate) fn create(path: &Path) -> Result<Self, Error> {
         let part_path = part_path(path);
-        let file = File::create(&part_path).map_err(Error::io("create", &part_path))?;
+        // Two workers may record one episode: a slot is played twice if its first worker is slow.
+        let options = File::options().write(true).create(true).truncate(false).open(&part_path);
+        let file = options.map_err(Error::io("create", &part_path))?;
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+            return Err(Error::LogInUse { path: path.to_owned() });
+        }
+        file.set_len(0).map_err(Error::io("create", &part_path))?;
         let writer = write_options().create(BufWriter::new(file));
         let writer = writer.map_err(Error::write_log(&part_path))?;
         Ok(Self { path: path.to_owned(), part_path, writer, buffer: Vec::new() })

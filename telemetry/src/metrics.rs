@@ -12,8 +12,7 @@ use crate::error::Error;
 
 /// Metrics after one evaluation.
 ///
-/// Shares are in [0, 1]. A value that does not exist (no update yet, no training episode) is NaN here and `null` in the
-/// file.
+/// Shares are in [0, 1]. Before the first round, losses and values of training are 0. NaN is `null` in the file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MetricsRow {
     /// Round after which the policy was evaluated.
@@ -40,13 +39,13 @@ pub struct MetricsRow {
     pub success_high: f64,
     /// Share of evaluation episodes with a contact between the arms, or between an arm and the table.
     pub collision_rate: f64,
-    /// Mean Q-value of the policy's actions.
+    /// Q-value of the policy's actions, mean over the updates of the latest round.
     #[serde(deserialize_with = "nan_from_null")]
     pub mean_q: f64,
-    /// Mean critic loss since the previous row.
+    /// Critic loss, mean over the updates of the latest round.
     #[serde(deserialize_with = "nan_from_null")]
     pub critic_loss: f64,
-    /// Mean actor loss since the previous row.
+    /// Actor loss, mean over the updates of the latest round.
     #[serde(deserialize_with = "nan_from_null")]
     pub actor_loss: f64,
     /// Units of advice spent so far.
@@ -57,10 +56,10 @@ pub struct MetricsRow {
     pub moved: f64,
     /// Share of evaluation episodes with such a contact before all objects were at their goals for good.
     pub collision_rate_before_success: f64,
-    /// Success rate of the training episodes since the previous row.
+    /// Success rate of the training episodes of the latest round.
     #[serde(deserialize_with = "nan_from_null")]
     pub training_success: f64,
-    /// Share of training episodes since the previous row in which an object was displaced.
+    /// Share of the training episodes of the latest round in which an object was displaced.
     #[serde(deserialize_with = "nan_from_null")]
     pub training_moved: f64,
     /// Mean return of the evaluation episodes: the undiscounted sum of joint rewards.

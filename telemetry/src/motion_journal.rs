@@ -24,7 +24,7 @@ const MAX_RECENT: usize = 1024;
 ///
 /// Logs are named `motion-DATE-NUMBER.mcap` and `stop-DATE-NUMBER.mcap`, with the date and time in UTC and a number that
 /// counts the logs of this journal. If a log cannot be written, the journal logs one warning, leaves the incomplete file
-/// and continues with the next motion, at the earliest ten seconds later.
+/// and tries again after ten seconds, also in the middle of a motion.
 pub struct MotionJournal {
     directory: PathBuf,
     budget: LogBudget,

@@ -117,7 +117,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 90] = [
+const CASES: [(&str, i32, &str); 95] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -159,6 +159,11 @@ const CASES: [(&str, i32, &str); 90] = [
     ("eval --policy %teacher-push --episodes 1 --record @empty/x.mcap", 64, "x.mcap"),
     ("eval --policy %teacher-push --episodes 1 --record-dir @empty/x", 64, "empty/x"),
     ("eval --composed-teachers %teacher-push --robustness", 64, "--policy"),
+    ("eval --composed-teachers %teacher-push --baselines", 64, "--policy"),
+    ("eval --policy %teacher-push --episodes 1 --record @folder", 64, "not a regular file"),
+    ("bridge trial --policy %student-push --policy %student-push", 64, "\"student-push\""),
+    ("bridge trial --policy %student-push --mode twin --mode twin", 64, "--mode twin"),
+    ("bench scale --workers 0 --idle 0", 64, "nothing to measure"),
     ("eval --policy %teacher-push --robustness --baselines", 64, "--baselines"),
     ("eval --policy %teacher-push --robustness --film @empty/x.gif", 64, "--film"),
     ("eval --composed-teachers %student-push", 64, "a teacher drives one"),

@@ -346,6 +346,9 @@ def main():
             check_drawings(browser.open(run.url))
             measure_viewers(run)
             measure_cost(run)
+            page.wait("document.hidden && document.getElementById('link').classList.contains('lost')", "a hidden page rests")
+            page.show()
+            page.wait("document.getElementById('link').textContent === 'live'", "the page is live again")
             run.process.send_signal(signal.SIGINT)
             page.wait("document.getElementById('phase').textContent === 'stopped'", "the end is shown", 30)
             assert run.process.wait(60) == 130, run.lines

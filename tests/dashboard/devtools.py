@@ -114,6 +114,10 @@ class Page:
             time.sleep(0.1)
         return value
 
+    def show(self):
+        """Brings the tab to the front, which hides the others."""
+        self.call("Page.bringToFront")
+
     def resize(self, width, height, dark=False):
         scheme = "dark" if dark else "light"
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500)

@@ -73,7 +73,7 @@ pub enum Error {
     },
     /// The server serves fewer environments than a slot has episodes.
     #[error(
-        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: lower rounds.rollouts"
+        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: serve rounds.rollouts of them, and at least 8 for evaluations"
     )]
     TooFewEnvironments {
         /// Address and program of the server.

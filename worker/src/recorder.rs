@@ -109,6 +109,9 @@ impl LogWriter {
                     tracing::info!(episode = number, "recording resumed");
                 }
             }
+            Err(RecordError::Log(tandem_telemetry::Error::LogInUse { path })) => {
+                tracing::debug!(episode = number, ?path, "another worker records the episode");
+            }
             Err(error @ RecordError::Log(_)) => {
                 self.n_to_skip = PAUSE_EPISODES;
                 if !std::mem::replace(&mut self.is_paused, true) {
@@ -129,7 +132,9 @@ impl LogWriter {
             Some(trace) => record_traced(metadata, episode, trace, path),
             None => record_episode(metadata, episode, path),
         };
-        if written.is_err() {
+        let is_of_another =
+            matches!(written, Err(RecordError::Log(tandem_telemetry::Error::LogInUse { .. })));
+        if written.is_err() && !is_of_another {
             // An incomplete log would occupy what may be the last space.
             drop(std::fs::remove_file(format!("{}.part", path.display())));
         }

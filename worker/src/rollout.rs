@@ -223,14 +223,19 @@ fn failed_step(error: EnvironmentError, rollouts: &[Rollout], step: usize) -> Ro
     }
 }
 
-/// Asks the teacher about the next actions of the advised rollouts, and applies its advice. If a unit pays for the lock
-/// step, the first of them claims it.
+/// Asks the teacher about the next actions of the rollouts that ask, and applies its advice. If a unit pays for the lock
+/// step, the slot's first advised episode claims it, whether or not it asks on this step: it has the slot's lease.
 fn take_advice(
     rollouts: &mut [Rollout],
     step_idx: usize,
     unit: AdviceUnit,
     advisor: &mut impl Advisor,
 ) -> Result<(), RolloutError> {
+    let payer_idx = match unit {
+        AdviceUnit::EnvStep => None,
+        AdviceUnit::SlotStep => rollouts.iter().position(|rollout| rollout.order.advised),
+    };
+    let payer = payer_idx.map(|idx| rollouts[idx].episode.number);
     let (mut advised, others): (Vec<&mut Rollout>, Vec<&mut Rollout>) =
         rollouts.iter_mut().partition(|rollout| rollout.asks);
     for trace in others.into_iter().filter_map(|rollout| rollout.trace.as_mut()) {
@@ -240,7 +245,6 @@ fn take_advice(
         return Ok(());
     };
     let first_number = first.episode.number;
-    let payer = (unit == AdviceUnit::SlotStep).then_some(first_number);
     let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
     let queries: Vec<StepQuery> = advised.iter().map(query).collect();
     let answers = advisor.advise(queries)?;
@@ -259,15 +263,15 @@ fn take_advice(
     }
     // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
     // teacher's account includes that unit, but no episode claims it.
-    match unit {
-        AdviceUnit::EnvStep => {
-            for rollout in advised {
+    match payer_idx {
+        None => {
+            for rollout in rollouts {
                 rollout.episode.advice_charged += u32::from(rollout.advised_arms != 0);
             }
         }
-        AdviceUnit::SlotStep => {
-            let any = advised.iter().any(|rollout| rollout.advised_arms != 0);
-            advised[0].episode.advice_charged += u32::from(any);
+        Some(idx) => {
+            let any = rollouts.iter().any(|rollout| rollout.advised_arms != 0);
+            rollouts[idx].episode.advice_charged += u32::from(any);
         }
     }
     Ok(())

@@ -90,9 +90,9 @@ impl Teacher {
                 stream.requests.send(request).await.map_err(|_unsent| closed())?;
                 stream
             }
-            None => self.open(request).await.map_err(without_account)?,
+            None => self.open(request).await.map_err(mended_by_others)?,
         };
-        let response = stream.responses.message().await.map_err(without_account)?;
+        let response = stream.responses.message().await.map_err(mended_by_others)?;
         let response = response.ok_or_else(closed)?;
         self.stream = Some(stream);
         Ok(response)
@@ -108,10 +108,11 @@ impl Teacher {
     }
 }
 
-/// Marks an unknown account as transient: the learner opens the account again after the teacher has lost it.
-fn without_account(status: Status) -> Status {
+/// Marks as transient what others mend: the learner opens an account again after the teacher has lost it, and a policy
+/// server may be restarted with the policy that the teacher began with.
+fn mended_by_others(status: Status) -> Status {
     match status.code() {
-        Code::NotFound => Status::unavailable(status.message()),
+        Code::NotFound | Code::FailedPrecondition => Status::unavailable(status.message()),
         _ => status,
     }
 }

@@ -21,7 +21,7 @@ pub struct FingerSettings {
     pub rest: f64,
     /// Smallest number of exchanges between two goals, and the number after which a change persists. Default 20.
     pub pause_exchanges: u32,
-    /// Exchanges after which a goal without a result is abandoned. Default 1000.
+    /// Exchanges within which a goal must end. Default 1000.
     pub timeout_exchanges: u32,
     /// Highest commanded speed of the joints of a stationary arm, radians per second. Default 0.5 degrees per second.
     pub stationary_radps: f64,
@@ -71,6 +71,11 @@ impl Fingers {
         self.active.is_some()
     }
 
+    /// Returns whether the active goal has had no result for too long. It may still be in the arm's queue.
+    pub(crate) fn is_overdue(&self) -> bool {
+        self.active.as_ref().is_some_and(|(_, n)| *n > self.settings.timeout_exchanges)
+    }
+
     /// Records that goal `id` was sent.
     pub(crate) fn goal_sent(&mut self, id: String) {
         self.active = Some((id, 0));
@@ -91,10 +96,7 @@ impl Fingers {
         self.n_since = self.n_since.saturating_add(1);
         self.wanted = wanted;
         if let Some((_, n)) = &mut self.active {
-            *n += 1;
-            if *n > settings.timeout_exchanges {
-                self.active = None;
-            }
+            *n = n.saturating_add(1);
             return None;
         }
         let change = (wanted - *self.at.get_or_insert(wanted)).abs();
@@ -155,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_goal_without_a_result_is_given_up() {
+    fn a_goal_without_a_result_is_overdue_and_stays_active() {
         let settings = FingerSettings { timeout_exchanges: 50, ..FingerSettings::default() };
         let mut fingers = Fingers::new(settings);
         fingers.next(1.0, true);
@@ -164,8 +166,9 @@ mod tests {
         fingers.goal_sent("a".into());
         fingers.goal_ended("b");
         assert!(fingers.busy());
-        let n = (1..200).find(|_| fingers.next(0.0, true).is_none() && !fingers.busy());
+        let n = (1..200).find(|_| fingers.next(0.0, true).is_none() && fingers.is_overdue());
         assert_eq!(n, Some(51));
+        assert!(fingers.busy());
     }
 
     #[test]

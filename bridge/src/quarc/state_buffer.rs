@@ -12,13 +12,13 @@ pub(crate) struct StateBuffer {
 }
 
 impl StateBuffer {
-    /// Adds received bytes and returns the newest state that they complete.
+    /// Adds received bytes and returns the newest state that they complete, with the faults of all of them.
     pub(crate) fn push(&mut self, bytes: &[u8]) -> Result<Option<PairState>, DriverError> {
         self.bytes.extend_from_slice(bytes);
         let (vectors, rest) = self.bytes.as_chunks::<STATE_BYTES>();
         let mut newest = None;
         for vector in vectors {
-            let state = decode_state(&from_bytes(vector))?;
+            let mut state = decode_state(&from_bytes(vector))?;
             if let Some(before) = self.sequence
                 && state.sequence != before + 1
             {
@@ -26,6 +26,9 @@ impl StateBuffer {
                 return Err(DriverError::Malformed { what });
             }
             self.sequence = Some(state.sequence);
+            if let Some(before) = newest.take() {
+                keep_faults(&mut state, &before);
+            }
             newest = Some(state);
         }
         self.bytes = rest.to_vec();
@@ -38,12 +41,22 @@ impl StateBuffer {
     }
 }
 
+/// Adds the faults of `before` to `state`, which replaces it: one that a single state reports counts too.
+pub(crate) fn keep_faults(state: &mut PairState, before: &PairState) {
+    for (arm, before) in state.arms.iter_mut().zip(&before.arms) {
+        arm.faults.drive |= before.faults.drive;
+        arm.faults.contact |= before.faults.contact;
+        arm.faults.emergency_stop |= before.faults.emergency_stop;
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use tandem_core::rng::{index, uniform};
     use tandem_core::{Stream, episode_rng};
 
     use super::*;
+    use crate::driver::Faults;
     use crate::quarc::codec::tests::state;
     use crate::quarc::codec::{encode_state, to_bytes};
 
@@ -67,6 +80,23 @@ mod tests {
                 assert_eq!(buffer.n_partial(), at % STATE_BYTES);
             }
         }
+    }
+
+    #[test]
+    fn a_fault_of_a_state_that_is_replaced_counts() {
+        let mut states: Vec<PairState> = (5..8).map(state).collect();
+        for state in &mut states {
+            for arm in &mut state.arms {
+                arm.faults = Faults::default();
+            }
+        }
+        states[0].arms[1].faults.contact = true;
+        let sent: Vec<u8> =
+            states.iter().flat_map(|state| to_bytes(&encode_state(state).unwrap())).collect();
+        let newest = StateBuffer::default().push(&sent).unwrap().unwrap();
+        assert_eq!(newest.sequence, 7);
+        let contacts: Vec<bool> = newest.arms.iter().map(|arm| arm.faults.contact).collect();
+        assert_eq!(contacts, [false, true]);
     }
 
     #[test]

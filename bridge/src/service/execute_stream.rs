@@ -85,8 +85,13 @@ async fn while_alive<T>(
         tokio::select! {
             done = &mut work => return Ok(done),
             request = requests.message() => {
-                if !is_alive(request) {
-                    return Err(Error::StreamEnded);
+                match request {
+                    Ok(Some(request)) if is_sign_of_life(&request) => {}
+                    Ok(Some(_)) => {
+                        return Err(DecodeError::new("alive", "a message", "another one").into());
+                    }
+                    Ok(None) => return Err(Error::StreamEnded),
+                    Err(status) => return Err(Error::StreamBroken(status)),
                 }
                 renew(arms, token).await?;
             }
@@ -94,10 +99,8 @@ async fn while_alive<T>(
     }
 }
 
-/// Returns whether the request is a sign of life.
-fn is_alive(request: Result<Option<pb::ExecuteRequest>, Status>) -> bool {
-    let request = request.ok().flatten().and_then(|request| request.request);
-    matches!(request, Some(pb::execute_request::Request::Alive(_)))
+fn is_sign_of_life(request: &pb::ExecuteRequest) -> bool {
+    matches!(request.request, Some(pb::execute_request::Request::Alive(_)))
 }
 
 /// Forwards signs of life and reports progress until the end of the motion. A stream that ends, breaks or contains
@@ -115,7 +118,10 @@ async fn run_stream(
     loop {
         tokio::select! {
             request = requests.message(), if !execution.is_abandoned() => {
-                if is_alive(request) { execution.mark_alive() } else { execution.abandon() }
+                match request {
+                    Ok(Some(request)) if is_sign_of_life(&request) => execution.mark_alive(),
+                    _ => execution.abandon(),
+                }
             }
             () = responses.closed() => return,
             changed = snapshots.changed() => {

@@ -5,10 +5,11 @@ use tandem_kinematics::plan::{MAX_STEP_M, MAX_WAYPOINTS};
 use tandem_kinematics::{ForwardKinematics, Gaps, Joints, Motion, PlacedArm, WorkCell};
 use tandem_proto::{DecodeError, pb};
 
-use crate::cell_file::{Arm, ArmTiming, CellFile};
+use crate::cell_file::{Arm, ArmTiming};
 use crate::driver::ArmReading;
 use crate::executor::{CheckError, CheckedMotion, Checker, Phase, Stop, Token};
 use crate::injection::{Fault, FaultKind};
+use crate::service::Config;
 use crate::service::execution::Outcome;
 use crate::service::motion::MotionError;
 use crate::service::reason_codes::{self, Values};
@@ -35,14 +36,13 @@ pub(super) fn decode_token(field: &str, text: &str) -> Result<Token, DecodeError
     }
 }
 
-/// Describes the arms of `checker`, which are those of the cell file `file`.
-pub(super) fn describe_arms(checker: &Checker, file: &CellFile) -> Vec<pb::ArmDescription> {
-    let timings = file.timings(checker.settings());
-    let arms = checker.cell().arms.iter().zip(&file.arms).zip(timings);
+/// Describes the arms of `cell`, which are those of the cell file in `config`.
+pub(super) fn describe_arms(cell: &WorkCell, config: &Config) -> Vec<pb::ArmDescription> {
+    let arms = cell.arms.iter().zip(&config.cell.arms).zip(&config.timings);
     arms.map(|((placed, arm), timing)| describe_arm(placed, arm, timing)).collect()
 }
 
-fn describe_arm(placed: &PlacedArm, arm: &Arm, timing: ArmTiming) -> pb::ArmDescription {
+fn describe_arm(placed: &PlacedArm, arm: &Arm, timing: &ArmTiming) -> pb::ArmDescription {
     let joint = |joint: &tandem_kinematics::model::Joint| pb::JointDescription {
         low_rad: joint.range_rad[0],
         high_rad: joint.range_rad[1],

@@ -1,7 +1,7 @@
 //! The thread that ticks the executor, and the handle through which calls reach it.
 //!
 //! The thread does no lengthy work: it receives checked motions, executes at most [`MAX_JOBS`] jobs before a tick, and
-//! publishes a snapshot after it, without waiting for its readers. Stops bypass the queue of jobs: they increment a counter that the thread reads first.
+//! publishes a snapshot after it, whose lock readers hold only to clone a pointer. Stops bypass the queue of jobs: they increment a counter that the thread reads first.
 
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -187,9 +187,12 @@ impl ControlLoop {
                 self.executor.renew(execution.token, now_s).ok();
             }
         }
+        // A motion that was stopped is over before a job can reset the arms or start another one.
+        self.finish_motion();
         for _ in 0..MAX_JOBS {
             let Ok(job) = self.jobs.try_recv() else { return };
             job(self, now_s);
+            self.finish_motion();
         }
     }
 
@@ -262,7 +265,12 @@ impl ArmsHandle {
         let mut snapshots = self.snapshots.clone();
         let stopped = async {
             let newest = snapshots.wait_for(|newest| newest.n_stops >= number).await;
-            newest.map(|newest| Arc::clone(&newest)).map_err(|_gone| Error::ShuttingDown)
+            newest.map(|newest| Arc::clone(&newest)).map_err(|_gone| {
+                match self.newest().stop_error.clone() {
+                    Some(error) => Error::StopFailed(error),
+                    None => Error::ShuttingDown,
+                }
+            })
         };
         let timed_out = |_elapsed| Err(Error::Timeout(CALL_TIMEOUT));
         let newest = tokio::time::timeout(CALL_TIMEOUT, stopped).await.unwrap_or_else(timed_out)?;

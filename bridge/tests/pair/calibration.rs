@@ -112,6 +112,7 @@ impl Driver for Watched {
     }
 
     fn stop(&mut self) -> Result<(), DriverError> {
+        self.told.lock().unwrap().newest = Some(Order::Stop);
         self.pair.stop()
     }
 }
@@ -131,6 +132,7 @@ fn one_joint_moves_at_a_time_and_an_interrupted_measurement_stops_the_arms() {
     let ended = calibrate(&mico_cell(), driver(), Settings::default(), 0.3, operator);
     assert_eq!(ended.unwrap_err(), CalibrationError::Interrupted);
     let told = told.lock().unwrap();
+    assert_eq!(told.newest, Some(Order::Stop), "the last order");
     assert_eq!(told.n_joints, 1);
     assert!(told.speed > 0.25 && told.speed < 0.36, "{}", told.speed);
 }

@@ -271,6 +271,7 @@ impl Rig {
             clock: clock.clone(),
             reconnect: reconnect(&tap),
             cell: CellFile::default(),
+            timings: CellFile::default().timings(&settings),
             cell_name: String::new(),
             // Arms that can lose their connection are real ones.
             injector: reconnect(&tap).is_none().then_some(injector),

@@ -12,7 +12,7 @@ use super::evaluations::Evaluations;
 use super::persistence::Persistence;
 use super::progress_publisher::ProgressPublisher;
 use super::run_lock::RunLock;
-use super::{Context, LearnerLoop};
+use super::{Context, LearnerLoop, is_beyond_end};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
@@ -57,6 +57,14 @@ impl InitialState {
         Ok(Self { trainer, resumption, is_resumed, lock })
     }
 
+    /// Returns true if the run has reached one of its ends.
+    pub(super) fn is_complete(&self, config: &LearnerConfig) -> bool {
+        let stop = &config.run.stop;
+        self.resumption.history.first_reaching(stop.until_success).is_some()
+            || is_beyond_end(&config.run, self.trainer.counters().round)
+            || (stop.max_minutes > 0.0 && self.resumption.wall_s >= stop.max_minutes * 60.0)
+    }
+
     /// Opens the run's account at the teacher if the run asks for advice.
     pub(super) fn open_account(
         &self,
@@ -87,6 +95,7 @@ impl InitialState {
             clock: config.clock.clone(),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
+                false if config.resume => RunStart::Restarted,
                 false => RunStart::New,
             },
         };

@@ -111,8 +111,7 @@ impl<'a> ProgressPublisher<'a> {
     }
 
     /// Returns a callback for the updates of a round, which measures each of them and publishes their number about once
-    /// a second. `learned` are
-    /// the counters before the first update.
+    /// a second. `learned` are the counters before the first update.
     pub(super) fn on_update(&self, learned: Counters) -> impl FnMut(u64) {
         let mut published_at_s = self.wall_s();
         let mut updated_at_s = published_at_s;

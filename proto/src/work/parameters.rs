@@ -204,8 +204,6 @@ mod tests {
         check(|m| m.critics[..4].fill(0xff), "critics[0]: expected a finite number, got NaN");
     }
 
-    /// Encodes and decodes a message.
-
     #[test]
     fn an_actor_round_trips() {
         let bytes = encode_actor(&actor()).encode_to_vec();

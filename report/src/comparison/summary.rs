@@ -83,7 +83,8 @@ impl Section {
     }
 }
 
-/// Formats a mean count to hundreds: 33,333 as 33.3k.
+/// Formats a mean count: 33,333 as 33.3k, and counts below 10,000 to one.
 fn rounded(count: f64) -> String {
-    short_number(100.0 * (count / 100.0).round())
+    let unit = if count < 10_000.0 { 1.0 } else { 100.0 };
+    short_number(unit * (count / unit).round())
 }

@@ -151,7 +151,7 @@ mod tests {
         };
         assert_eq!(
             refusal(&actor, Some(&critic)),
-            "a teacher needs a policy for 1 arm with 1 value, this one is for 2 with 2"
+            "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives 2 and returns 2"
         );
         assert_eq!(
             refusal(&policy_file("teacher-push-classic.safetensors"), Some(&critic)),

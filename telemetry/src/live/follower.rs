@@ -102,7 +102,7 @@ impl Follower {
         let is_left_out = |log: &&PathBuf| evaluation(log) <= evaluation(&path);
         self.seen.extend(new.iter().filter(is_left_out).cloned());
         let mut episode = Episode::read(&path).ok()?;
-        let start_ns = if self.end_ns == 0 { 0 } else { self.end_ns + PAUSE_NS };
+        let start_ns = if self.end_ns == 0 { 0 } else { self.end_ns.saturating_add(PAUSE_NS) };
         episode.shift(start_ns);
         self.end_ns = start_ns.max(episode.end_ns());
         self.server.channels.open(&episode.channels).ok()?;

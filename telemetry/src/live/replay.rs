@@ -74,7 +74,7 @@ impl Replay {
         let mut episodes = Vec::new();
         for path in logs {
             let episode = Episode::read(path)?;
-            let start_ns = spans.last().map_or(0, |span| span.end_ns + PAUSE_NS);
+            let start_ns = spans.last().map_or(0, |span| span.end_ns.saturating_add(PAUSE_NS));
             let end_ns = start_ns.saturating_add(episode.end_ns());
             spans.push(LogSpan { path: path.clone(), start_ns, end_ns });
             episodes.push(episode.channels);

@@ -1,8 +1,8 @@
 //! Rehearsed motions that also succeed where the arms' world differs from the training world.
 //!
 //! A motion without feedback cannot react to the differences between the world of its rehearsal and the one of its
-//! execution. Each variant of the training world differs in friction and mass, and its hands are displaced by a few
-//! millimetres. In more than half of them the pads that grasp are of rubber.
+//! execution. Each variant but the first, which is the training world itself, differs in friction or mass, and its
+//! hands are displaced by a few millimetres. In more than half of them the pads that grasp are of rubber.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::{ArmIndex, Contacts, Layout, TaskSpec, WorldSettings};
