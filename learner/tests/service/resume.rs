@@ -93,29 +93,47 @@ async fn a_run_that_ends_with_a_success_rate_ends_with_the_same_one_when_resumed
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_run_interrupted_repeatedly_ends_with_the_same_bits() {
     for lag in [0, 1] {
-        let expected = calm(config(lag)).await;
-        let directory = tempfile::tempdir().expect("a directory");
-        let mut n_starts = 0;
-        let ended = loop {
-            n_starts += 1;
-            let served =
-                Served::start(learner_config(config(lag), directory.path(), n_starts > 1)).await;
-            let mut toy = served.join("toy").await;
-            for _ in 0..7 {
-                if !toy.play_one().await {
-                    break;
-                }
-            }
-            served.shutdown.cancel();
-            let ended = served.end().await.expect("saved");
-            assert_eq!(ended.digest.len(), 64, "reported after an interruption too");
-            if !ended.interrupted {
-                break ended;
-            }
-        };
-        assert!(n_starts > 4, "{n_starts} starts");
-        assert_eq!(Left::behind(&ended, directory.path()), expected, "lag {lag}");
+        check_interruptions(config(lag), 7).await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_interrupted_in_an_evaluation_that_ends_it_learns_no_further_round() {
+    let whole = calm(config(0)).await;
+    let highest = whole.rows[..4].iter().map(|row| row.success).fold(0.0, f64::max);
+    let mut run = config(0);
+    run.stop.until_success = highest;
+    run.stop.max_env_steps = 0;
+    // A round has four slots.
+    for n_slots in 4..=8 {
+        check_interruptions(run.clone(), n_slots).await;
+    }
+}
+
+/// Checks that a run that is interrupted each time it has played `n_slots` slots ends as an undisturbed one.
+async fn check_interruptions(run: RunConfig, n_slots: usize) {
+    let expected = calm(run.clone()).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    let mut n_starts = 0;
+    let ended = loop {
+        n_starts += 1;
+        let served =
+            Served::start(learner_config(run.clone(), directory.path(), n_starts > 1)).await;
+        let mut toy = served.join("toy").await;
+        for _ in 0..n_slots {
+            if !toy.play_one().await {
+                break;
+            }
+        }
+        served.shutdown.cancel();
+        let ended = served.end().await.expect("saved");
+        assert_eq!(ended.digest.len(), 64, "reported after an interruption too");
+        if !ended.interrupted {
+            break ended;
+        }
+    };
+    assert!(n_starts > 2, "{n_starts} starts");
+    assert_eq!(Left::behind(&ended, directory.path()), expected, "{n_slots} slots at a time");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
