@@ -158,8 +158,8 @@ impl Values {
             let values: Vec<(&str, String)> =
                 kinds.iter().map(|(kind, table)| (*kind, text_at(table, key))).collect();
             let (_, usual) = &values[0];
-            // A kind is left out only if its value is that of every kind that generalizes it and is printed, or else the
-            // usual one.
+            // A kind is omitted if all printed kinds that generalize it have its value or, if none is printed, if it has
+            // the usual value.
             let differs = |(idx, (_, value)): &(usize, &(&str, String))| {
                 let general = GENERALIZED_BY[*idx].iter().map(|of| &values[*of].1);
                 let mut printed = general.filter(|of| *of != usual).peekable();

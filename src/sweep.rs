@@ -309,10 +309,9 @@ impl<'a> Sweep<'a> {
             }
             RunOutcome::Failed(why) => {
                 self.display.ended(&name, &format!("failed: {why}"));
-                // A full disk may have ended the run; the other runs go on.
+                // A full disk may have ended the run; the other runs continue.
                 if let Err(error) = status.fail(why) {
-                    let text = "its cause is not kept in its directory";
-                    self.display.print(&format!("{name}: {text}: {error:#}"));
+                    self.display.print(&format!("{name}: the cause is not saved: {error:#}"));
                 }
             }
             RunOutcome::Interrupted => self.display.print(&format!("{name}: saved")),

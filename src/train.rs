@@ -234,7 +234,7 @@ impl<'a> Supervisor<'a> {
         }
         self.stream = stream;
         if self.last.task.is_empty() {
-            // The learner has loaded its checkpoint, so the run goes on.
+            // The learner has loaded its checkpoint, so the run continues.
             let removed = summary::remove(&self.plan.out);
             for kept in [removed, self.plan.keep_teacher(), self.plan.keep_environment()] {
                 if let Err(failed) = kept {

@@ -46,7 +46,8 @@ impl ReportInputs {
         Ok(inputs)
     }
 
-    /// Returns true if the run or file `path` was not read before: it counts once, however often it is named.
+    /// Returns true if the run or file `path` was not read before. A path that is named again adds a warning and is not
+    /// read.
     fn is_new(&mut self, path: &Path) -> bool {
         let Ok(canonical) = path.canonicalize() else { return true };
         let is_new = self.read.insert(canonical);

@@ -90,9 +90,9 @@ impl Teacher {
                 stream.requests.send(request).await.map_err(|_unsent| closed())?;
                 stream
             }
-            None => self.open(request).await.map_err(mended_by_others)?,
+            None => self.open(request).await.map_err(with_transient_failures)?,
         };
-        let response = stream.responses.message().await.map_err(mended_by_others)?;
+        let response = stream.responses.message().await.map_err(with_transient_failures)?;
         let response = response.ok_or_else(closed)?;
         self.stream = Some(stream);
         Ok(response)
@@ -108,9 +108,9 @@ impl Teacher {
     }
 }
 
-/// Marks as transient what others mend: the learner opens an account again after the teacher has lost it, and a policy
-/// server may be restarted with the policy that the teacher began with.
-fn mended_by_others(status: Status) -> Status {
+/// Marks failures that other processes resolve as transient: the learner reopens an account that the teacher has lost, and
+/// a policy server may be restarted with the policy that the teacher started with.
+fn with_transient_failures(status: Status) -> Status {
     match status.code() {
         Code::NotFound | Code::FailedPrecondition => Status::unavailable(status.message()),
         _ => status,

@@ -12,8 +12,8 @@ use crate::kinova_ros::following::{Following, LEAST_SHARE, Shortfall};
 use crate::kinova_ros::preparation::Preparation;
 use crate::kinova_ros::protocol;
 
-/// The largest number of velocities in flight to ROS: those of one second. An executor stops much earlier: at
-/// the first state after 60 ms without an effect, or because no state arrives.
+/// The largest number of velocities in flight to ROS: those of one second. An executor stops much earlier:
+/// at the first state after 60 ms without an effect, or because states are missing.
 pub(crate) const MAX_IN_FLIGHT: usize = 100;
 
 /// The state of one arm's node.

@@ -1,7 +1,8 @@
 //! The thread that ticks the executor, and the handle through which calls reach it.
 //!
 //! The thread does no lengthy work: it receives checked motions, executes at most [`MAX_JOBS`] jobs before a tick, and
-//! publishes a snapshot after it, whose lock readers hold only to clone a pointer. Stops bypass the queue of jobs: they increment a counter that the thread reads first.
+//! publishes a snapshot after it, whose lock readers hold only to clone a pointer. Stops bypass the queue of jobs: they
+//! increment a counter that the thread reads first.
 
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
