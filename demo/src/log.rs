@@ -96,6 +96,9 @@ impl EpisodeLog {
         }
         let mut raw = RawLog::default();
         for_each_record(bytes, Part::File, |opcode, body| raw.add(opcode, body))?;
+        if !raw.in_summary {
+            return Err(Error::Damaged("no record ends its data".to_owned()));
+        }
         let metadata = match (raw.metadata, raw.is_trial) {
             (Some(metadata), _) => metadata,
             (None, true) => return Err(Error::TrialLog),

@@ -7,12 +7,11 @@ use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
 use tandem_core::{ArmAdvice, Contacts, TaskSpec};
-use tandem_system::regular_file;
 
 use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
 use crate::recorder::{OUTCOME_TOPIC, TRANSITION_TOPIC};
-use crate::records::Records;
+use crate::records::{Records, read_mcap};
 use crate::{motion_log, trial_log};
 
 /// A recorded episode.
@@ -56,7 +55,7 @@ pub struct LoggedTransition {
 /// If the file cannot be read, is incomplete, or is not the log of an episode. Logs of trials and of motions are errors
 /// of their own, [`Error::TrialLog`] and [`Error::MotionLog`].
 pub fn read_episode(path: &Path) -> Result<EpisodeLog, Error> {
-    let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
+    let bytes = read_mcap(path)?;
     let not_an_episode = |problem| Error::NotAnEpisode { path: path.to_owned(), problem };
     let raw = read_raw(&bytes).map_err(Error::read_log(path))?;
     match (&raw.metadata, raw.other) {

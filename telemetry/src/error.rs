@@ -138,10 +138,6 @@ impl Error {
 
     /// Returns a function for `map_err` on reading a log.
     pub(crate) fn read_log(path: &Path) -> impl FnOnce(mcap::McapError) -> Self {
-        let path = path.to_owned();
-        move |source| match source {
-            mcap::McapError::BadMagic => Self::NotMcap { path },
-            source => Self::ReadLog { path, source },
-        }
+        move |source| Self::ReadLog { path: path.to_owned(), source }
     }
 }

@@ -1,12 +1,29 @@
 //! Reading of the records of an MCAP file that may be damaged.
 
+use std::path::Path;
+
 use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use tandem_system::regular_file;
+
+use crate::error::Error;
 
 /// Maximum size of a record or an uncompressed chunk. The reader allocates as much as a length field declares. Chunks
 /// of Tandem's logs have less than 1 MiB.
 const MAX_RECORD_BYTES: usize = 16 << 20;
+
+/// Reads the MCAP file `path`, which may end anywhere.
+///
+/// # Errors
+/// If the file cannot be read, or does not start like an MCAP file.
+pub(crate) fn read_mcap(path: &Path) -> Result<Vec<u8>, Error> {
+    let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
+    if !bytes.starts_with(mcap::MAGIC) && !mcap::MAGIC.starts_with(&bytes) {
+        return Err(Error::NotMcap { path: path.to_owned() });
+    }
+    Ok(bytes)
+}
 
 /// An iterator over the schemas, channels, messages, metadata and the end of the data of a file, in order and including
 /// those within chunks.
@@ -17,12 +34,15 @@ pub(crate) struct Records<'a> {
     unread: &'a [u8],
     reader: LinearReader,
     failed: bool,
+    /// The record that ends the data is still to come, and must.
+    needs_data_end: bool,
 }
 
 impl<'a> Records<'a> {
     /// Reads a file that must be complete: everything is verified up to the last byte.
     pub(crate) fn of_complete(bytes: &'a [u8]) -> Self {
-        Self::new(bytes, LinearReaderOptions::default().with_check_finishes_after_end_magic(true))
+        let options = LinearReaderOptions::default().with_check_finishes_after_end_magic(true);
+        Self { needs_data_end: true, ..Self::new(bytes, options) }
     }
 
     /// Reads a file that may end anywhere.
@@ -37,7 +57,8 @@ impl<'a> Records<'a> {
             .with_validate_data_section_crc(true)
             .with_validate_summary_section_crc(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
-        Self { unread: bytes, reader: LinearReader::new_with_options(options), failed: false }
+        let reader = LinearReader::new_with_options(options);
+        Self { unread: bytes, reader, failed: false, needs_data_end: false }
     }
 
     fn read(&mut self) -> Option<mcap::McapResult<Record<'static>>> {
@@ -68,8 +89,16 @@ impl Iterator for Records<'_> {
         if self.failed {
             return None;
         }
-        let record = self.read();
-        self.failed = matches!(record, Some(Err(_)));
+        let record = match self.read() {
+            // The reader accepts a file without this record.
+            None if self.needs_data_end => Some(Err(McapError::UnexpectedEof)),
+            record => record,
+        };
+        match &record {
+            Some(Ok(Record::DataEnd(_))) => self.needs_data_end = false,
+            Some(Err(_)) => self.failed = true,
+            _ => {}
+        }
         record
     }
 }
@@ -114,12 +143,29 @@ mod tests {
 
     /// Returns a file with one record.
     fn file(opcode: u8, body: &[u8]) -> Vec<u8> {
+        [mcap::MAGIC, &record(opcode, body)].concat()
+    }
+
+    fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
         let length = (body.len() as u64).to_le_bytes();
-        [mcap::MAGIC, &[opcode], length.as_slice(), body].concat()
+        [&[opcode], length.as_slice(), body].concat()
     }
 
     fn read(opcode: u8, body: &[u8]) -> Vec<mcap::McapResult<Record<'static>>> {
         Records::of_partial(&file(opcode, body)).collect()
+    }
+
+    #[test]
+    fn a_complete_file_says_where_its_data_end() {
+        let records = |data_end: &[u8]| {
+            let (header, footer) = (file(op::HEADER, &[0; 8]), record(op::FOOTER, &[0; 20]));
+            let file = [&header, data_end, &footer, mcap::MAGIC].concat();
+            Records::of_complete(&file).collect::<Vec<_>>()
+        };
+        let complete = records(&record(op::DATA_END, &[0; 4]));
+        assert!(matches!(complete.as_slice(), [Ok(Record::DataEnd(_))]), "{complete:?}");
+        let without = records(&[]);
+        assert!(matches!(without.as_slice(), [Err(McapError::UnexpectedEof)]), "{without:?}");
     }
 
     #[test]

@@ -257,7 +257,10 @@ fn a_file_that_is_not_the_log_of_an_episode_is_refused() {
         read_episode(&path).unwrap_err().to_string()
     };
     assert!(refusal(b"not an mcap file at all").contains("is not an MCAP file"));
-    for content in [&b""[..], &bytes[..bytes.len() / 2], &bytes[..bytes.len() - 3]] {
+    let last_byte_changed = [&bytes[..bytes.len() - 1], b"?"].concat();
+    let part = |n_bytes| &bytes[..n_bytes];
+    let half = part(bytes.len() / 2);
+    for content in [part(0), part(5), half, part(bytes.len() - 3), &last_byte_changed] {
         assert!(refusal(content).contains("not a complete MCAP file"), "{}", refusal(content));
     }
     assert!(matches!(recover(&path, &dir.path().join("x")), Ok(_) | Err(Error::ReadLog { .. })));

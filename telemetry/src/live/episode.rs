@@ -7,11 +7,10 @@ use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, Timesta
 use foxglove::{Decode, Encode};
 use mcap::McapError;
 use mcap::records::Record;
-use tandem_system::regular_file;
 
 use crate::error::Error;
 use crate::log_file::timestamp;
-use crate::records::Records;
+use crate::records::{Records, read_mcap};
 
 /// A channel of a log.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,7 +41,7 @@ pub(super) struct Episode {
 impl Episode {
     /// Reads the log `path`.
     pub(super) fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
+        let bytes = read_mcap(path)?;
         Self::decode(&bytes).map_err(Error::read_log(path))
     }
 
