@@ -1,6 +1,8 @@
 //! Errors of a learner.
 
 use std::path::PathBuf;
+
+use tandem_net::MAX_MESSAGE_BYTES;
 use tandem_rl::config::{ConfigError, INIT_TEACHER};
 use tandem_rl::ddpg::DdpgError;
 
@@ -35,6 +37,17 @@ pub enum Error {
     /// The run cannot start from the given teacher, or none was given.
     #[error("strategy {INIT_TEACHER:?} {0}")]
     StartFrom(String),
+    /// Workers cannot be sent the networks.
+    #[error(
+        "the networks that workers act with are {} MiB large and a message at most {}: lower ddpg.n_hidden or \
+         ddpg.n_hidden_layers",
+        n_bytes.div_ceil(1 << 20),
+        MAX_MESSAGE_BYTES >> 20
+    )]
+    NetworksTooLarge {
+        /// Size of the message.
+        n_bytes: usize,
+    },
     /// Learning diverged.
     #[error(transparent)]
     Diverged(#[from] DdpgError),

@@ -35,6 +35,12 @@ impl EncodedResponse {
         Self(frame.freeze())
     }
 
+    /// Returns the number of bytes of the message.
+    #[must_use]
+    pub fn message_bytes(&self) -> usize {
+        self.0.len() - PREFIX_BYTES
+    }
+
     /// Returns the response to a call: an empty message, which the service's [`Router`](crate::Router) replaces by the
     /// encoded one.
     #[must_use]
@@ -93,7 +99,9 @@ mod tests {
     #[tokio::test]
     async fn a_body_is_one_frame_with_an_ok_status() {
         let message = HealthCheckRequest { service: "a".to_owned() };
-        let body = EncodedResponse::encode(&message).into_body().collect().await.unwrap();
+        let encoded = EncodedResponse::encode(&message);
+        assert_eq!(encoded.message_bytes(), 3);
+        let body = encoded.into_body().collect().await.unwrap();
         assert_eq!(body.trailers().unwrap()["grpc-status"], "0");
         let bytes = body.to_bytes();
         assert_eq!(bytes[..5], [0, 0, 0, 0, 3]);

@@ -179,7 +179,7 @@ impl AdviceConfig {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RoundsConfig {
-    /// Slots per round, 1 to 4096 (paper: 16, one per worker).
+    /// Slots per round, 1 to 4096, and at most 65,536 / `rollouts` (paper: 16, one per worker).
     pub slots: usize,
     /// Episodes per slot, stepped in lock step, 1 to 64 (paper: 2).
     pub rollouts: usize,

@@ -154,6 +154,7 @@ pub(super) fn learner_failed(error: Error) -> Failed {
         | Error::NoTeacher(_)
         | Error::Teacher(_)
         | Error::StartFrom(_)
+        | Error::NetworksTooLarge { .. }
         | Error::Checkpoint(
             CheckpointError::OtherSettings { .. }
             | CheckpointError::RunExists(_)

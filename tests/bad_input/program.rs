@@ -117,7 +117,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 95] = [
+const CASES: [(&str, i32, &str); 97] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -134,6 +134,8 @@ const CASES: [(&str, i32, &str); 95] = [
     ("train --set ddpg.discount=nan", 64, "[0, 1)"),
     ("train --max-minutes nan", 64, "stop.max_minutes"),
     ("train --arms 3", 64, "1 or 2"),
+    ("train --set rounds.slots=4096 --set rounds.rollouts=17", 64, "65,536 / rounds.rollouts"),
+    ("train --no-dashboard --set ddpg.n_hidden=4096 --set ddpg.n_hidden_layers=2", 64, "66 MiB"),
     ("train --arms two", 64, "two"),
     ("train --seed -1", 64, "-1"),
     ("train --task shove", 64, "shove"),

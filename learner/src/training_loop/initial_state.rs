@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use tandem_core::work::{PublishedActor, RunTerms};
-use tandem_proto::pb;
+use tandem_net::{EncodedResponse, MAX_MESSAGE_BYTES};
+use tandem_proto::{encode_actor, pb};
 use tandem_rl::trainer::Trainer;
 use tandem_system::atomic_file;
 use tandem_telemetry::events::RunResumed;
@@ -54,6 +55,10 @@ impl InitialState {
             }
         };
         trainer.set_threads(config.n_threads);
+        let n_bytes = EncodedResponse::encode(&encode_actor(&trainer.publish())).message_bytes();
+        if n_bytes > MAX_MESSAGE_BYTES {
+            return Err(Error::NetworksTooLarge { n_bytes });
+        }
         Ok(Self { trainer, resumption, is_resumed, lock })
     }
 

@@ -8,6 +8,9 @@ use tandem_core::settings::OutOfRange;
 
 use super::{ConfigError, RunConfig};
 
+/// Most episodes of a round, whose reservations a teacher takes in one request.
+const MAX_EPISODES: usize = 65_536;
+
 impl RunConfig {
     /// Returns the configuration if every setting is in its range.
     ///
@@ -74,6 +77,10 @@ impl RunConfig {
         check("rounds.slots", rounds.slots, (1..=4096).contains(&rounds.slots), "1 to 4096")?;
         let is_slot = (1..=64).contains(&rounds.rollouts);
         check("rounds.rollouts", rounds.rollouts, is_slot, "1 to 64")?;
+        let is_round = rounds.slots * rounds.rollouts <= MAX_EPISODES;
+        let expected =
+            "at most 65,536 / rounds.rollouts, because a teacher advises no more episodes";
+        check("rounds.slots", rounds.slots, is_round, expected)?;
         check("rounds.lag", rounds.lag, rounds.lag <= 1, "0 or 1")?;
         let updates = rounds.updates_per_env_step;
         let is_rate = (1e-9..=100.0).contains(&updates);

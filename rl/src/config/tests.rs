@@ -141,6 +141,7 @@ fn a_bad_value_is_named() {
     check(|config| config.seed = TEST_SEED, "seed is 777: expected another seed");
     check(|config| config.evaluation.seed = TEST_SEED, "evaluation.seed is 777");
     check(|config| config.rounds.per_epoch = 0, "rounds.per_epoch");
+    check(|config| (config.rounds.slots, config.rounds.rollouts) = (4096, 17), "rounds.slots");
     check(|config| config.rounds.final_greedy_share = f64::NAN, "rounds.final_greedy_share");
     check(|config| config.evaluation.early_points = 101, "evaluation.early_points");
     let too_much = |config: &mut RunConfig| {

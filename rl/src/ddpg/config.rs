@@ -52,7 +52,8 @@ pub struct DdpgConfig {
     /// transitions.
     #[serde(default = "one_batch")]
     pub batches_per_update: usize,
-    /// Units of each hidden layer of both networks, 1 to 4,096 (paper, section 4.1: 256).
+    /// Units of each hidden layer of both networks, 1 to 4,096 (paper, section 4.1: 256). What workers act with, the
+    /// actor and for some strategies the critics, must fit a message of 64 MiB.
     pub n_hidden: usize,
     /// Hidden layers of both networks, 1 to 16 (paper, section 4.1: teacher 3, student 4).
     pub n_hidden_layers: usize,
