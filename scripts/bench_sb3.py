@@ -206,8 +206,11 @@ def main():
         state = resume(run)
         settings, clocks = state["settings"], state
     else:
-        if (run / "progress.csv").exists():
+        if (run / "state.json").exists():
             sys.exit(f"bench_sb3: {run} holds a run already: choose another directory, or give --resume")
+        progress = run / "progress.csv"
+        if progress.exists() and len(progress.read_text(encoding="utf-8").splitlines()) > 1:
+            sys.exit(f"bench_sb3: {progress} is of a run that was never saved: delete it, or choose another directory")
         names = "algorithm env seed evaluate_every evaluation_episodes evaluation_seed save_every"
         settings = {name: getattr(arguments, name) for name in names.split()}
     try:

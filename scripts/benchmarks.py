@@ -175,7 +175,7 @@ def tandem_command(piece, run, options):
         return [*command, "--resume"]
     command += ["--seed", str(piece.seed)]
     if is_built_in:
-        command += ["--task", "push", "--arms", "1"]
+        command += ["--task", "push", "--world", "classic", "--arms", "1"]
     if piece.strategy:
         command += ["--strategy", piece.strategy]
     if piece.teacher:
@@ -314,6 +314,9 @@ def collect(options):
         target.mkdir(parents=True, exist_ok=True)
         for file in files:
             shutil.copy(file, target / file.name)
+            if file.suffix in (".jsonl", ".csv"):
+                # A run that is being written may end within a line.
+                (target / file.name).write_text("".join(complete_lines(file)), encoding="utf-8")
         summary = target / "summary.json"
         if summary.is_file():
             content = json.loads(summary.read_text(encoding="utf-8"))
@@ -332,7 +335,9 @@ def parse():
     training = commands.add_parser("run", help="runs or resumes pieces, one after the other")
     training.set_defaults(command=run)
     training.add_argument("names", nargs="*", metavar="NAME", help="names of pieces; * matches any characters")
-    training.add_argument("--group", action="append", default=[], help="all pieces of a group; can be repeated")
+    groups = sorted({piece.group for piece in pieces().values()})
+    of_group = {"action": "append", "default": [], "choices": groups, "metavar": "GROUP"}
+    training.add_argument("--group", **of_group, help="all pieces of a group; can be repeated")
     training.add_argument("--max-minutes", type=float, default=180, help="wall-clock limit of a piece [default: 180]")
     training.add_argument("--max-env-steps", type=int, default=1_000_000, help="[default: 1000000]")
     training.add_argument("--workers", type=int, help="worker processes of Tandem [default: one per core]")

@@ -88,6 +88,7 @@ def main():
     args = parser.parse_args()
     try:
         policy = tandem.load_policy(args.policy)
+        policy.env_id  # Raises an error for a task of another simulator.
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     if "carry-bar" in policy.task:

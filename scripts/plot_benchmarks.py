@@ -58,7 +58,9 @@ def read(file):
 
 def rows_of(file):
     with open(file, newline="", encoding="utf-8") as lines:
-        return [json.loads(line) for line in lines] if file.suffix == ".jsonl" else list(csv.DictReader(lines))
+        # A run that is being written, or was killed, may end within a line.
+        complete = [line for line in lines if line.endswith("\n")]
+    return [json.loads(line) for line in complete] if file.suffix == ".jsonl" else list(csv.DictReader(complete))
 
 
 def test_of(file):
@@ -162,10 +164,13 @@ def main():
     if not runs:
         raise Wrong(f"no run has {', '.join(NAMES)}")
     empty = [str(path) for path, evaluations in runs if not evaluations]
+    runs = [(path, evaluations) for path, evaluations in runs if evaluations]
     if empty:
-        raise Wrong(f"no evaluations in {', '.join(empty)}")
-    tests = [test_of(file) for _, file in files if file is not None]
-    results = [measures(path, evaluations, test) for (path, evaluations), test in zip(runs, tests, strict=True)]
+        message = f"no evaluations in {', '.join(empty)}"
+        if not runs:
+            raise Wrong(message)
+        print(f"plot_benchmarks: {message}: left out", file=sys.stderr)
+    results = [measures(path, evaluations, test_of(file_of(path))) for path, evaluations in runs]
     if arguments.out:
         plot(runs, arguments.x, arguments.out)
     print(json.dumps(results)) if arguments.json else print_table(results)

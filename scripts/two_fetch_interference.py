@@ -8,6 +8,7 @@ are although they are apart, the share in which both are over one table, and the
 
 import argparse
 import json
+import sys
 
 import numpy as np
 
@@ -94,7 +95,10 @@ def main():
         print("| distance | one arm, alone | both, apart | both, over one table | arms touch |")
         print("|---|---|---|---|---|")
     for distance in arguments.distances:
-        result = measure(distance, arguments.episodes)
+        try:
+            result = measure(distance, arguments.episodes)
+        except ValueError as error:
+            sys.exit(f"error: {error}")
         if arguments.json:
             print(json.dumps(result), flush=True)
         else:

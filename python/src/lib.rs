@@ -19,7 +19,7 @@ mod _native {
     #[pymodule_export]
     use super::simulation::{Simulation, compute_reward};
     #[pymodule_export]
-    use super::task::task_description;
+    use super::task::{check_task, task_description};
     #[pymodule_export]
     use super::vector::VectorSimulation;
 }

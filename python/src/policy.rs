@@ -73,6 +73,12 @@ impl Policy {
         self.policy.n_heads
     }
 
+    /// False for a policy whose critic is unknown, such as an actor from another program.
+    #[getter]
+    fn has_critic(&self) -> bool {
+        self.policy.has_critic()
+    }
+
     /// The file's entries about training and success rates.
     #[getter]
     fn metadata(&self) -> BTreeMap<String, String> {
@@ -122,6 +128,9 @@ impl Policy {
         goals: PyReadonlyArray2<'py, f32>,
         actions: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        if !self.policy.has_critic() {
+            return Err(value_error("the policy has no critic, and so no values"));
+        }
         let layout = &self.policy.layout;
         let n_rows = observations.as_array().nrows();
         let observations = checked(&observations, n_rows, layout.n_observation(), "observations")?;

@@ -168,7 +168,7 @@ impl Simulation {
         step: fn(&mut Episode, &[f32]) -> Result<(), SimError>,
     ) -> PyResult<Step<'py>> {
         self.check_started()?;
-        let action = action_of(action)?;
+        let action = action_of(action, self.n_action())?;
         let episode = &mut self.episode;
         py.detach(|| step(episode, &action)).map_err(|error| step_error(&error))?;
         Ok((self.observation(py)?, self.episode.reward, false, false, self.info(py)?))
@@ -212,11 +212,18 @@ pub(crate) fn settings_arguments(
 }
 
 /// Returns the numbers of an action: a float32 array, or any sequence of numbers.
-fn action_of(action: &Bound<'_, PyAny>) -> PyResult<Vec<f32>> {
-    match action.cast::<PyArray1<f32>>() {
-        Ok(array) => Ok(array.readonly().as_array().iter().copied().collect()),
-        Err(_) => action.extract(),
+fn action_of(action: &Bound<'_, PyAny>, n_action: usize) -> PyResult<Vec<f32>> {
+    if let Ok(array) = action.cast::<PyArray1<f32>>() {
+        return Ok(array.readonly().as_array().iter().copied().collect());
     }
+    // Arrays of other types, such as tensors of PyTorch, are sequences; those of rows are not sequences of numbers.
+    let py = action.py();
+    let n_dimensions = action.getattr(intern!(py, "ndim")).and_then(|number| number.extract());
+    if n_dimensions.is_ok_and(|number: usize| number != 1) {
+        let shape = action.getattr(intern!(py, "shape"))?;
+        return Err(value_error(format!("the action has shape {shape}, expected ({n_action},)")));
+    }
+    action.extract()
 }
 
 /// Returns the sparse rewards, shape `[n]`, of `achieved` and `desired` goals, both of shape `[n, n_goal]`.

@@ -3,7 +3,7 @@
 use pyo3::PyResult;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use tandem_core::{Layout, Task};
+use tandem_core::{Layout, Task, TaskDescription, TaskSpec};
 
 use crate::episode::value_error;
 
@@ -22,4 +22,14 @@ pub(crate) fn task_description(name: &str, n_arms: usize) -> PyResult<String> {
     }
     let described = serde_json::to_string(&Layout::new(task, n_arms).description());
     described.map_err(|error| PyRuntimeError::new_err(error.to_string()))
+}
+
+/// Checks a description of a task, given as JSON, as every service does that receives one.
+///
+/// # Errors
+/// Returns a `ValueError` that names the first field with an invalid value.
+#[pyfunction]
+pub(crate) fn check_task(description: &str) -> PyResult<()> {
+    let description: TaskDescription = serde_json::from_str(description).map_err(value_error)?;
+    TaskSpec::new(description).map(drop).map_err(value_error)
 }

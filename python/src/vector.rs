@@ -103,13 +103,13 @@ impl VectorSimulation {
         Ok(Self { slots: vec![slot; num_envs], threads, max_episode_steps, autoreset })
     }
 
-    /// Starts the first episodes of the runs of `seeds`, or without seeds the next episodes, in the environments of
+    /// Starts the first episodes of the runs of `seeds`, or without a seed the next episode, in the environments of
     /// `mask`. Both have shape `[num_envs]`. An environment outside `mask` that never started keeps its seed for its first
     /// episode. Returns observations and infos of all environments.
     fn reset<'py>(
         &mut self,
         py: Python<'py>,
-        seeds: Option<Vec<u64>>,
+        seeds: Option<Vec<Option<u64>>>,
         mask: Vec<bool>,
     ) -> PyResult<(Observations<'py>, Infos<'py>)> {
         self.check_length("mask", mask.len())?;
@@ -119,7 +119,7 @@ impl VectorSimulation {
         let (slots, threads) = (&mut self.slots, &self.threads);
         let start = |(idx, slot): (usize, &mut Slot)| {
             slot.last = None;
-            let seed = seeds.as_ref().map(|seeds| seeds[idx]);
+            let seed = seeds.as_ref().and_then(|seeds| seeds[idx]);
             if mask[idx] {
                 slot.start(seed);
             } else if let Some(seed) = seed

@@ -57,6 +57,8 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
     Plays a few short episodes, to find the achieved goal within the observation and to compare the environment's
     reward with the sparse reward of the description.
     """
+    if not (np.isfinite(options.bound) and options.bound > 0):
+        raise ServiceError(f"the bound must be a positive number, not {options.bound}")
     spaces, action = _checked_spaces(env)
     samples = _probe(env)
     has_several_arms = options.arms is not None and len(options.arms) > 1
@@ -240,10 +242,10 @@ def _name(env: gymnasium.Env[Any, Any], given: str | None) -> str:
 
 
 def _bounds(space: gymnasium.spaces.Box, default: float) -> list[float]:
-    """Returns the largest magnitude of each number of `space`, or `default` where it is unbounded."""
+    """Returns the largest magnitude of each number of `space`, or `default` where it is unbounded or always 0."""
     magnitude = np.maximum(np.abs(space.low), np.abs(space.high)).astype(np.float64)
     # Spaces without a real bound have the largest number of their type instead of infinity.
-    magnitude[magnitude > np.finfo(np.float32).max / 2] = default
+    magnitude[(magnitude > np.finfo(np.float32).max / 2) | (magnitude == 0)] = default
     return [float(bound) for bound in magnitude]
 
 

@@ -27,6 +27,8 @@ LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 _FLOAT = np.dtype("<f4")
 ACTION_SLACK = 1e-6
 """The distance by which rounding may move an action out of [-1, 1]."""
+_GRACE_S = 5.0
+"""Time in which a process of environments must end once its stream has ended."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -97,14 +99,23 @@ def _serve_pipe(pipe: Any, pickled: bytes) -> None:
     environments.close()
 
 
+def _pickled(create: Callable[[], GymEnvironment]) -> bytes:
+    """Returns what creates an environment in another process."""
+    import cloudpickle
+
+    try:
+        pickled: bytes = cloudpickle.dumps(create)
+        return pickled
+    except Exception as error:  # Objects raise errors of their own.
+        message = f"the environment cannot be created in other processes: {type(error).__name__}: {error}"
+        raise ServiceError(f"{message}; workers=1 needs none") from error
+
+
 class _ProcessPool:
     """Environments of a stream, divided among processes that step them at the same time."""
 
-    def __init__(self, create: Callable[[], GymEnvironment], n_processes: int) -> None:
-        import cloudpickle
-
+    def __init__(self, pickled: bytes, n_processes: int) -> None:
         context = multiprocessing.get_context("spawn")
-        pickled = cloudpickle.dumps(create)
         self._pipes = []
         self._processes = []
         for _ in range(n_processes):
@@ -125,7 +136,17 @@ class _ProcessPool:
         for pipe in self._pipes:
             pipe.close()
         for process in self._processes:
-            process.join(5)
+            process.join(_GRACE_S)
+        self._kill()
+
+    def abandon(self) -> None:
+        """Ends the processes if an environment hangs, which also ends the wait for its answer."""
+        timer = threading.Timer(_GRACE_S, self._kill)
+        timer.daemon = True
+        timer.start()
+
+    def _kill(self) -> None:
+        for process in self._processes:
             if process.is_alive():
                 process.kill()
 
@@ -233,16 +254,14 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
     def __init__(
         self,
         task: Task,
-        create: Callable[[], GymEnvironment],
+        open_environments: Callable[[], _Environments | _ProcessPool],
         *,
         n: int,
-        n_processes: int,
         max_streams: int,
     ) -> None:
         self._task = task
-        self._create = create
+        self._open_environments = open_environments
         self._n = n
-        self._n_processes = n_processes
         self._room = threading.Semaphore(max_streams)
         self._max_streams = max_streams
 
@@ -256,7 +275,7 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
             message = f"the server plays {self._max_streams} streams already"
             context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, message)
         try:
-            yield from self._play(requests)
+            yield from self._play(requests, context)
         except Refused as error:
             context.abort(error.code, str(error))
         except EnvironmentFailure as error:
@@ -266,12 +285,13 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
         finally:
             self._room.release()
 
-    def _play(self, requests: Any) -> Iterator[environment_pb2.PlayResponse]:
-        environments: _Environments | _ProcessPool
-        if self._n_processes > 1:
-            environments = _ProcessPool(self._create, self._n_processes)
-        else:
-            environments = _Environments(self._create)
+    def _play(self, requests: Any, context: Any) -> Iterator[environment_pb2.PlayResponse]:
+        try:
+            environments = self._open_environments()
+        except OSError as error:
+            raise EnvironmentFailure(f"cannot start the processes of the environments: {error}") from error
+        if isinstance(environments, _ProcessPool):
+            context.add_callback(environments.abandon)
         with contextlib.closing(environments):
             stream = _Stream(self._task, environments, self._n)
             for request in requests:
@@ -340,18 +360,25 @@ class EnvironmentServer(Server):
             "episode_steps": episode_steps,
             "bound": bound,
         }
-        with contextlib.closing(make(env_fn)) as env:
-            self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
         try:
-            self.task.to_message()
-        except (TypeError, ValueError) as error:
-            raise ServiceError(f"the task cannot be described: {error}") from error
+            with contextlib.closing(make(env_fn)) as env:
+                self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
+        except ServiceError:
+            raise
+        except Exception as error:  # Environments raise errors of their own.
+            raise ServiceError(f"the environment cannot be used: {type(error).__name__}: {error}") from error
+        self.task.check()
         task = self.task
 
         def create() -> GymEnvironment:
             return GymEnvironment(make(env_fn), task, appends_goal)
 
-        servicer = _Servicer(task, create, n=n, n_processes=workers, max_streams=max_streams)
+        pickled = _pickled(create) if workers > 1 else b""
+
+        def open_environments() -> _Environments | _ProcessPool:
+            return _ProcessPool(pickled, workers) if workers > 1 else _Environments(create)
+
+        servicer = _Servicer(task, open_environments, n=n, max_streams=max_streams)
         super().__init__(
             lambda server: environment_pb2_grpc.add_EnvironmentServicer_to_server(servicer, server),
             listen=listen,
@@ -377,7 +404,8 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       env_fn: a function that creates a Gymnasium environment, or an id for `gymnasium.make`. The observation is a Dict
         of observation, achieved_goal and desired_goal; the action space is a bounded Box.
       n: the largest number of environments of a stream.
-      workers: the number of processes that step the environments of a stream; with 1, the server's own.
+      workers: the number of processes that step the environments of a stream, to which cloudpickle sends `env_fn`; with
+        1, the server's own.
       max_streams: the largest number of simultaneous streams.
       name: the name of the task; by default the environment's id in lower case.
       arms: the indices of each arm's part of the vectors (`tandem.Arm`); by default one arm with all of them.
@@ -395,7 +423,7 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
         with which its rewards agree.
       episode_steps: control steps per episode; by default `max_episode_steps` of its spec.
-      bound: the largest magnitude of numbers for which the spaces have no bound; by default 1000.
+      bound: the largest magnitude of numbers for which the spaces have no bound, or 0; by default 1000.
       token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.
 
     Raises:

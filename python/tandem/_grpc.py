@@ -6,6 +6,7 @@ import hmac
 import ipaddress
 import os
 import pathlib
+import socket
 import ssl
 import threading
 from collections.abc import Callable
@@ -207,6 +208,19 @@ def open_channel(address: str, token_file: Path | None = None, tls_ca: Path | No
     if token_file is None:
         return channel
     return grpc.intercept_channel(channel, _SendToken(read_token(token_file)))
+
+
+def uses_tls(address: str, timeout_s: float) -> bool:
+    """Returns whether a server at the address answers a TLS handshake."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    host, port = parse_address(address)
+    try:
+        with socket.create_connection((host.strip("[]"), port), timeout_s) as connection:
+            context.wrap_socket(connection, server_hostname=host.strip("[]")).close()
+        return True
+    except (OSError, ValueError):
+        return False
 
 
 class _CallDetails(grpc.ClientCallDetails):  # type: ignore[misc]

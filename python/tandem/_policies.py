@@ -27,8 +27,8 @@ MAX_STATES = 256
 _N_FINGERPRINT = 64
 
 
-def _functions(policy: Policy) -> tuple[PolicyFn, ValueFn]:
-    """Returns the actor and the critic of a policy from a file."""
+def _functions(policy: Policy) -> tuple[PolicyFn, ValueFn | None]:
+    """Returns the actor and the critic, if it has one, of a policy from a file."""
 
     def inputs(observations: Floats, goals: Floats) -> dict[str, Floats]:
         return {"observation": observations, "desired_goal": goals}
@@ -39,7 +39,7 @@ def _functions(policy: Policy) -> tuple[PolicyFn, ValueFn]:
     def value(observations: Floats, goals: Floats, actions: Floats) -> ArrayLike:
         return policy.q(inputs(observations, goals), actions)
 
-    return act, value
+    return act, value if policy.has_critic else None
 
 
 class PolicyFailure(Exception):
@@ -211,6 +211,7 @@ class PolicyServer(Server):
         if task is None:
             raise ServiceError("give the task of the policy: the name of a built-in one, such as shared-push, or a Task")
         self.task = Task.built_in(task) if isinstance(task, str) else task
+        self.task.check()
         if len(self.task.arms) != 1:
             raise ServiceError(f"a teacher's policy drives 1 arm, the task has {len(self.task.arms)}")
         served = _Policy(policy, value, self.task, batched)
@@ -240,9 +241,9 @@ def serve_policy(
     Prints `listening on http://HOST:PORT` once it serves.
 
     Arguments:
-      policy: a one-arm policy of `tandem.load_policy`, which needs no other argument; or a function of observations,
-        shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in [-1, 1], shape
-        `[m, n_action]`; all float32.
+      policy: a one-arm policy of `tandem.load_policy`, which needs no other argument if its task is a built-in one; or
+        a function of observations, shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in
+        [-1, 1], shape `[m, n_action]`; all float32.
       task: the name of a built-in task, such as `shared-push`, or a `tandem.Task` of one arm.
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
         without it, strategies that compare values are not available.

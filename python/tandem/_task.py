@@ -221,6 +221,19 @@ class Task:
             **described, arms=arms, reflection=reflection, manipulation=Manipulation(**manipulation, arms=acting)
         )
 
+    def check(self) -> None:
+        """Checks every field as the services that receive the description do.
+
+        Raises:
+            ServiceError: A field has another type, or an invalid value.
+        """
+        try:
+            # As a message the numbers are plain ones, with the bits that are sent.
+            described = dataclasses.asdict(Task.from_message(self.to_message())) | {"norm": self.norm}
+            _native.check_task(json.dumps(described, allow_nan=False))
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ServiceError(f"the task cannot be described: {error}") from error
+
     def to_message(self) -> task_pb2.TaskDescription:
         """Returns the message `tandem.v1.TaskDescription`."""
         message = task_pb2.TaskDescription(

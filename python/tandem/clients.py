@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tandem._grpc import Path, ServiceError, grpc, open_channel
+from tandem._grpc import Path, ServiceError, grpc, open_channel, uses_tls
 from tandem._proto import (
     bridge_pb2,
     bridge_pb2_grpc,
@@ -45,6 +45,7 @@ __all__ = [
 _TEMPORARY = frozenset({"UNAVAILABLE", "DEADLINE_EXCEEDED", "RESOURCE_EXHAUSTED", "ABORTED", "INTERNAL"})
 _KEEP_ALIVE_S = 0.04
 """Time between two signs of life; the bridge requires one every 0.1 s."""
+_PROBE_S = 1.0
 _STEP_S = 0.04
 _RESET_ATTEMPTS = 11
 _RESET_PAUSE_S = 0.1
@@ -83,6 +84,7 @@ class _Client:
     ) -> None:
         self._address = address
         self._timeout_s = timeout_s
+        self._is_plain = tls_ca is None
         self._channel = open_channel(address, token_file, tls_ca)
 
     def close(self) -> None:
@@ -108,8 +110,19 @@ class _Client:
         except grpc.RpcError as error:
             code, details = error.code().name, error.details()
             if code == "DEADLINE_EXCEEDED":
-                details = f"no answer within {self._timeout_s:g} s"
+                details = f"no answer within {self._timeout_s:g} s{self._connection_failure()}"
             raise CallError(code, f"{self._address}: {details}") from error
+
+    def _connection_failure(self) -> str:
+        """Returns why there is no connection, after a colon; nothing if there is one."""
+        try:
+            # A call that does not wait for a connection fails with the reason why there is none.
+            self._channel.unary_unary("/grpc.health.v1.Health/Check")(b"", timeout=_PROBE_S)
+        except grpc.RpcError as error:
+            if error.code() is grpc.StatusCode.UNAVAILABLE:
+                hint = "; it uses TLS: give tls_ca" if self._is_plain and uses_tls(self._address, _PROBE_S) else ""
+                return f": {error.details()}{hint}"
+        return ""
 
 
 @dataclasses.dataclass(frozen=True)

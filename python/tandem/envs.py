@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, cast
 
 import gymnasium
@@ -104,9 +105,14 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
 
         Returns:
             Observation and info.
+
+        Raises:
+            ValueError: The seed, an option or the number of the episode is out of range; nothing has changed.
         """
-        super().reset(seed=seed)
+        if seed is not None:
+            checked_number("seed", seed)
         number = episode_option(options)
+        super().reset(seed=seed)
         if seed is not None:
             self._seed, self._episode = seed, 0
         elif self._seed is None:
@@ -121,7 +127,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         """Executes `action`, shape `[n_action]`, for one control step.
 
         Raises:
-            ValueError: The action has another length or contains a number that is not finite; nothing has moved.
+            ValueError: The action has another shape or contains a number that is not finite; nothing has moved.
         """
         return self._simulation.step(action)
 
@@ -134,6 +140,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> NDArray[np.uint8] | None:
         """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
         return None if self.render_mode is None else self._simulation.render(*self._size)
+
+    def __copy__(self) -> TandemEnv:
+        # A shallow copy would share the simulation.
+        return copy.deepcopy(self)
 
 
 def task_name(task: str, world: str) -> str:
@@ -189,7 +199,18 @@ def episode_option(options: dict[str, Any] | None) -> int | None:
     number = options.pop("episode", None)
     if options:
         raise ValueError(f"unknown options {sorted(options)}: expected episode")
-    return None if number is None else int(number)
+    return None if number is None else checked_number("episode", int(number))
+
+
+def checked_number(name: str, number: int) -> int:
+    """Returns a seed or the number of an episode.
+
+    Raises:
+        ValueError: It is not in [0, 2**64).
+    """
+    if not 0 <= number < 2**64:
+        raise ValueError(f"{name} is {number}, expected 0 to 2**64 - 1")
+    return number
 
 
 def check_rendering(render_mode: str | None, width: int, height: int) -> None:

@@ -51,6 +51,11 @@ class Policy:
         raise ValueError(f"task {self.task!r} is not of this package's simulator: create its environment by its own id")
 
     @property
+    def has_critic(self) -> bool:
+        """Whether the policy has values; an actor that was imported without a critic has none."""
+        return self._native.has_critic
+
+    @property
     def metadata(self) -> dict[str, str]:
         """Entries of the file about training and success rates."""
         return self._native.metadata
@@ -98,7 +103,7 @@ class Policy:
             action: Actions in [-1, 1], shape `[n_action]` or `[batch, n_action]`.
 
         Raises:
-            ValueError: An array has another shape or contains a number that is not finite.
+            ValueError: The policy has no critic, or an array has another shape or contains a number that is not finite.
         """
         observations, goals, is_batch = self._inputs(observation)
         values = self._native.q(observations, goals, _rows(action))

@@ -32,7 +32,7 @@ class TorchPolicy(nn.Module):
     """A policy as a PyTorch module, float32, ready for inference or further training.
 
     `forward(observation, goal)` returns actions, shape `[..., n_action]`; `q(observation, goal, action)` returns
-    values, shape `[..., n_heads]`.
+    values, shape `[..., n_heads]`, or raises a `ValueError` if the policy has no critic.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -42,6 +42,7 @@ class TorchPolicy(nn.Module):
         self.critic = nn.Sequential(*_layers(tensors, "critic.0"))
         self.normalize_observation = _normalizer(tensors, "observation")
         self.normalize_goal = _normalizer(tensors, "goal")
+        self._has_critic = policy.has_critic
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Returns actions in [-1, 1]."""
@@ -50,6 +51,8 @@ class TorchPolicy(nn.Module):
 
     def q(self, observation: Tensor, goal: Tensor, action: Tensor) -> Tensor:
         """Returns the values of actions."""
+        if not self._has_critic:
+            raise ValueError("the policy has no critic, and so no values")
         inputs = torch.cat([self._inputs(observation, goal), action], dim=-1)
         values: Tensor = self.critic(inputs)
         return values

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from pathlib import Path
 from typing import Any, cast
@@ -233,6 +234,10 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     def __getstate__(self) -> dict[str, Any]:
         # MuJoCo's data are pickled with every number of the episode; a renderer belongs to its process.
         return {**self.__dict__, "_renderer": None}
+
+    def __copy__(self) -> TwoFetchEnv:
+        # A shallow copy would share MuJoCo's data.
+        return copy.deepcopy(self)
 
     def _place_robots(self) -> None:
         """Takes over the state in which Fetch's environments start, for each arm in its frame.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -17,6 +18,7 @@ from tandem.envs import (
     RENDER_FPS,
     Observation,
     check_rendering,
+    checked_number,
     compute_reward,
     spaces_of,
     task_name,
@@ -100,28 +102,36 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         self._is_seeded = False
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode in every environment.
 
         Args:
-            seed: A number `s` gives environment `i` seed `s + i`; a sequence gives each its own. Without a seed, every
-                environment starts the next episode of its seed.
+            seed: A number `s` gives environment `i` seed `s + i`; a sequence gives each its own. All of them are in
+                [0, 2**64). Without a seed, or where it is None, an environment starts the next episode of its seed.
             options: `{"reset_mask": mask}`, shape `[num_envs]`, resets only the environments where it is true.
 
         Returns:
             Observations, each of shape `[num_envs, ...]`, and infos.
+
+        Raises:
+            ValueError: A seed or an option is out of range; no environment has changed.
         """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)), dtype=np.bool_)
         if options:
             raise ValueError(f"unknown options {sorted(options)}: expected reset_mask")
+        if isinstance(seed, (int, np.integer)):
+            seeds: list[int | None] = [int(seed) + idx for idx in range(self.num_envs)]
+        else:
+            seeds = [None] * self.num_envs if seed is None else [None if one is None else int(one) for one in seed]
+        for idx, one in enumerate(seeds):
+            if one is not None:
+                checked_number(f"the seed of environment {idx}", one)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        if seed is None and not self._is_seeded:
-            seed = [int(drawn) for drawn in self.np_random.integers(2**63, size=self.num_envs)]
-        elif isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + idx for idx in range(self.num_envs)]
-        seeds = None if seed is None else [int(each) for each in seed]
+        if not self._is_seeded and None in seeds:
+            drawn = self.np_random.integers(2**63, size=len(seeds)).tolist()
+            seeds = [new if one is None else one for one, new in zip(seeds, drawn, strict=True)]
         observations, infos = self._simulation.reset(seeds, mask.tolist())
         self._is_seeded = True
         return _observation(observations), _info(infos)
@@ -137,7 +147,10 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
             ValueError: The actions have another shape or contain a number that is not finite, or an environment has no
                 episode; no environment has moved.
         """
-        step = self._simulation.step(np.asarray(actions, dtype=np.float32))
+        actions = np.asarray(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions have shape {actions.shape}, expected {self.action_space.shape}")
+        step = self._simulation.step(actions)
         observations, rewards, truncations, infos = step
         info = _info(infos)
         if self._mode is AutoresetMode.SAME_STEP and truncations.any():
@@ -154,6 +167,10 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Draws every scene, shape `[height, width, 3]` each, in render mode `rgb_array`."""
         return None if self.render_mode is None else tuple(self._simulation.render(*self._size))
+
+    def __copy__(self) -> TandemVectorEnv:
+        # A shallow copy would share the simulations.
+        return copy.deepcopy(self)
 
     def _add_final(self, info: dict[str, Any], is_over: NDArray[np.bool_]) -> None:
         """Adds what `SyncVectorEnv` reports about episodes that ended, in its form."""

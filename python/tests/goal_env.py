@@ -1,5 +1,6 @@
 """A small Gymnasium environment with goals, for tests of servers."""
 
+import threading
 from typing import Any
 
 import gymnasium
@@ -21,6 +22,7 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         maximum: bool = False,
         dense: bool = False,
         fails_at: int | None = None,
+        hangs_at: int | None = None,
         terminates_at: int | None = None,
         contacts: bool = False,
         tandem_task: dict[str, Any] | None = None,
@@ -39,6 +41,7 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self.distance_threshold = threshold
         self._contained, self._maximum, self._dense = contained, maximum, dense
         self._fails_at, self._terminates_at = fails_at, terminates_at
+        self._hangs_at = hangs_at
         self._contacts = contacts
         self.tandem_task = tandem_task
 
@@ -53,6 +56,8 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self.actions.append(action)
         if len(self.actions) == self._fails_at:
             raise RuntimeError("the motor is on fire")
+        if len(self.actions) == self._hangs_at:
+            threading.Event().wait()
         self._position = self._position + action / 10
         terminated = len(self.actions) == self._terminates_at
         reward = self.compute_reward(self._position, self._goal, {})

@@ -38,7 +38,7 @@ def test_a_teacher_answers_and_its_refusals_are_errors():
 def test_nothing_that_answers_is_an_error_within_the_timeout():
     with (
         tandem.Teacher("127.0.0.1:1", timeout_s=0.3) as teacher,
-        pytest.raises(tandem.CallError, match="no answer within 0.3 s") as raised,
+        pytest.raises(tandem.CallError, match="no answer within 0.3 s: .*Connection refused") as raised,
     ):
         teacher.describe()
     assert raised.value.is_temporary
@@ -126,6 +126,9 @@ def test_calls_use_tls_and_the_token(tmp_path):
             assert raised.value.code == "UNAUTHENTICATED"
         with pytest.raises(tandem.ServiceError, match="requires TLS"):
             tandem.Teacher(f"https://{address}")
+        with tandem.Teacher(address, timeout_s=1) as teacher:
+            with pytest.raises(tandem.CallError, match="no answer within 1 s: .*; it uses TLS: give tls_ca"):
+                teacher.describe()
 
     def act(observation, goal):
         return np.zeros((len(observation), 3))

@@ -6,11 +6,14 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import goal_env
+import gymnasium
 import numpy as np
 import pytest
 from goal_env import STEPS, PointEnv
@@ -48,12 +51,12 @@ class Client:
     def __init__(self, server: tandem.EnvironmentServer) -> None:
         self.stub = environment_pb2_grpc.EnvironmentStub(open_channel(server.address))
 
-    def play(self, requests: list[pb.PlayRequest]) -> list[pb.PlayResponse]:
-        return list(self.stub.Play(iter(requests), timeout=30))
+    def play(self, requests: list[pb.PlayRequest], timeout_s: float = 30) -> list[pb.PlayResponse]:
+        return list(self.stub.Play(iter(requests), timeout=timeout_s))
 
-    def refusal(self, requests: list[pb.PlayRequest]) -> tuple[str, str]:
+    def refusal(self, requests: list[pb.PlayRequest], timeout_s: float = 30) -> tuple[str, str]:
         with pytest.raises(grpc.RpcError) as raised:
-            self.play(requests)
+            self.play(requests, timeout_s)
         return raised.value.code().name, raised.value.details()
 
 
@@ -192,8 +195,6 @@ def test_streams_beyond_the_limit_are_refused() -> None:
 
 
 def _endless(first: pb.PlayRequest) -> Iterator[pb.PlayRequest]:
-    import threading
-
     yield first
     threading.Event().wait(30)
 
@@ -219,9 +220,14 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
         ({}, {"tolerance": 0.3}, "compute_reward returned -1 at euclidean distance 0.2"),
         ({}, {"norm": "maximum"}, "compute_reward returned -1 at maximum distance"),
         ({}, {"tolerance": -1.0}, "the tolerance must be a positive number"),
+        ({}, {"bound": 0.0}, "the bound must be a positive number, not 0.0"),
+        ({}, {"bound": float("nan")}, "the bound must be a positive number, not nan"),
         ({}, {"name": "My env"}, "'My env' is not a name"),
         ({}, {"arms": [tandem.Arm((0, 4), (0,), (0,))]}, "indices of the observation"),
         ({}, {"arms": [tandem.Arm((0,), (0,), (0,)), tandem.Arm((1, 2), (1,), (1,))]}, "differ in length"),
+        ({}, {"arms": [PAIR[0], tandem.Arm((2,), (1,), (1,), hand=(2,))]}, "arms[1].hand: expected 0 numbers, got 1"),
+        ({}, {"contact_distances": (0.1, 0.1, 0.1)}, "three finite numbers above 0 for arms with hands"),
+        ({"fails_at": 3}, {}, "the environment cannot be used: RuntimeError: the motor is on fire"),
         ({}, {"achieved_goal": [1, 2]}, "does not have the achieved goal at [1, 2]"),
         ({}, {"achieved_goal": [1]}, "expected 2 indices from 0 to 3, got [1]"),
         ({}, {"reports_contacts": True, "arms": PAIR}, "have no arm_contact"),
@@ -236,6 +242,40 @@ def test_an_environment_that_cannot_be_served_is_refused(
 ) -> None:
     with pytest.raises(tandem.ServiceError, match=re.escape(message)):
         tandem.EnvironmentServer((ID, kwargs), **options)
+
+
+def test_a_number_that_is_always_zero_has_the_default_bound() -> None:
+    env, bound = PointEnv(), np.array([9.0, np.inf, np.inf, 0.0])
+    env.observation_space["observation"] = gymnasium.spaces.Box(-bound, bound, dtype=np.float64)
+    with tandem.EnvironmentServer(lambda: env, episode_steps=STEPS, bound=50.0) as server:
+        assert list(server.task.observation_bound) == [9.0, 50.0, 50.0, 50.0]
+
+
+def test_an_environment_that_cannot_be_sent_to_processes_is_refused() -> None:
+    lock = threading.Lock()
+
+    def env_fn() -> Any:
+        with lock:
+            return gymnasium.make(ID)
+
+    with pytest.raises(tandem.ServiceError, match="cannot be created in other processes: TypeError: cannot pickle"):
+        tandem.EnvironmentServer(env_fn, workers=2)
+
+
+def test_a_hung_environment_occupies_no_stream_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tandem._environments._GRACE_S", 0.5)
+    requests = [reset([(0, 1)]), *[step(np.zeros((1, 2)))] * 11]
+    with tandem.EnvironmentServer((ID, {"hangs_at": 11}), workers=2, max_streams=1) as server:
+        client = Client(server)
+        assert client.refusal(requests, timeout_s=5)[0] == "DEADLINE_EXCEEDED"
+        deadline = time.monotonic() + 20
+        while True:
+            try:
+                assert len(client.play(requests[:1])) == 1
+                break
+            except grpc.RpcError as error:
+                assert error.code().name == "RESOURCE_EXHAUSTED" and time.monotonic() < deadline, error
+                time.sleep(0.1)
 
 
 def test_the_norm_is_found() -> None:
@@ -373,7 +413,6 @@ def test_an_environment_may_describe_itself() -> None:
 def test_what_arms_share_and_success_needs_is_described() -> None:
     held = [tandem.Condition((2, 3), 0.5), tandem.Condition((3,), 0.25, target=(2.0,))]
     manipulation = tandem.Manipulation(
-        shared_object=True,
         one_arm_task="point",
         success_steps=3,
         arms=(tandem.ArmManipulation(gripper=0, holding=held[:1], conditions=held[1:]), tandem.ArmManipulation()),
@@ -388,12 +427,14 @@ def test_what_arms_share_and_success_needs_is_described() -> None:
         message = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
     first = message.manipulation.arms[0]
     assert (first.gripper, list(first.holding[0].numbers), list(first.conditions[0].target)) == (0, [2, 3], [2.0])
-    assert message.manipulation.shared_object and message.manipulation.success_steps == 3
+    assert message.manipulation.success_steps == 3
     assert not message.manipulation.arms[1].HasField("gripper")
     assert (message.base, [list(arm.lateral) for arm in message.arms]) == (-0.5, [[2], [1]])
     assert [list(arm.hand) for arm in message.arms] == [[3, 2, 3], [0, 1, 0]]
     assert list(message.contact_distances) == [0.5, 0.25, 0.125]
     assert tandem.Task.from_message(message).to_message() == message
+    with tandem.EnvironmentServer(ID, arms=PAIR, manipulation=tandem.Manipulation(shared_object=True)) as server:
+        assert Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task.manipulation.shared_object
 
 
 def test_a_reflection_is_described() -> None:

@@ -114,6 +114,9 @@ def test_bad_actions_are_refused_and_change_nothing():
         (np.zeros(5, np.float32), "5"),
         (np.full(6, np.nan, np.float32), "NaN"),
         ([0.0] * 5 + [float("inf")], "inf"),
+        (np.zeros((1, 6), np.float32), r"shape \(1, 6\), expected \(6,\)"),
+        (np.zeros((6, 1)), r"shape \(6, 1\), expected \(6,\)"),
+        (np.float32(0), r"shape \(\), expected \(6,\)"),
     ]:
         with pytest.raises(ValueError, match=message):
             env.step(action)
@@ -151,6 +154,21 @@ def test_wrong_arguments_name_what_is_wrong():
         env.step(np.zeros(6))
     with pytest.raises(ValueError, match="unknown options"):
         env.reset(options={"epsiode": 1})
+
+
+def test_a_refused_seed_or_number_changes_nothing():
+    env, other = tandem.TandemEnv("push", 1), tandem.TandemEnv("push", 1)
+    for each in (env, other):
+        each.reset(seed=5)
+    for arguments, message in [
+        ({"seed": 2**64}, r"seed is 18446744073709551616, expected 0 to 2\*\*64 - 1"),
+        ({"seed": -1}, "seed is -1"),
+        ({"options": {"episode": -1}}, "episode is -1"),
+        ({"seed": 3, "options": {"episode": 2**64}}, "episode is 18446744073709551616"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            env.reset(**arguments)
+    assert all(map(np.array_equal, arrays_of(env.reset()[0]), arrays_of(other.reset()[0])))
 
 
 def test_grasped_starts_hold_the_cube_in_the_hand():
@@ -195,6 +213,14 @@ def test_a_copy_continues_the_episode_with_its_bits(env_id, duplicate, rng):
     for action in actions[9:]:
         expected, observation = env.step(action)[0], simulation.step(action)[0]
         assert all(map(np.array_equal, arrays_of(observation), arrays_of(expected)))
+
+
+def test_a_shallow_copy_has_a_simulation_of_its_own():
+    env = tandem.TandemEnv("push", 1)
+    env.reset(seed=5)
+    other = copy.copy(env)
+    expected = other.step(np.ones(3))[0]
+    assert np.array_equal(env.step(np.ones(3))[0]["observation"], expected["observation"])
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

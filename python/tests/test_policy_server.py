@@ -18,6 +18,7 @@ from tandem._proto import policy_pb2_grpc
 
 TEACHER = ROOT / "policies" / "teacher-push.safetensors"
 STUDENT = ROOT / "policies" / "student-push-classic.safetensors"
+PUSH = dataclasses.replace(tandem.Task.built_in("push"), name="my-push")
 RNG = np.random.default_rng(4)
 
 
@@ -159,6 +160,9 @@ def test_a_failing_policy_is_reported_and_the_server_goes_on():
         (follow, {"task": "push", "digest": "a b"}, "'a b' is not a digest"),
         (follow, {}, "give the task"),
         (tandem.load_policy(STUDENT), {}, "drives 1 arm, this one drives 2"),
+        (follow, {"task": dataclasses.replace(PUSH, goal_bound=())}, "goal_bound: expected 3 numbers, got 0"),
+        (follow, {"task": dataclasses.replace(PUSH, tolerance="5 cm")}, "the task cannot be described"),
+        (follow, {"task": dataclasses.replace(PUSH, norm="taxicab")}, "unknown variant `taxicab`"),
     ],
 )
 def test_a_policy_that_cannot_be_served_is_refused(policy, options, message):
@@ -222,6 +226,19 @@ def test_a_teacher_without_values_offers_no_strategy_that_compares_them():
         teacher.open_account("mine", budget=10, strategy="ea")
         (advice,) = teacher.advise("mine", steps(1))
         assert advice.charged and all(arm.overridden for arm in advice.arms)
+
+
+def test_an_actor_without_a_critic_has_no_values(tmp_path):
+    actor, imported = tmp_path / "actor.onnx", tmp_path / "imported.safetensors"
+    for command in (["export", str(TEACHER), "--onnx", str(actor)], ["import", str(actor), "--out", str(imported)]):
+        subprocess.run([program(), "policy", *command], check=True, capture_output=True)
+    policy = tandem.load_policy(imported)
+    assert not policy.has_critic and tandem.load_policy(TEACHER).has_critic
+    with pytest.raises(ValueError, match="the policy has no critic"):
+        policy.q({"observation": np.zeros(28), "desired_goal": np.zeros(3)}, np.zeros(3))
+    with tandem.PolicyServer(policy) as server:
+        assert not stub(server).Describe(pb.DescribePolicyRequest()).has_values
+        assert len(evaluate(server).actions) == 36 and not evaluate(server).values
 
 
 def test_an_absent_policy_is_waited_for_and_another_one_is_refused():

@@ -151,7 +151,7 @@ def test_bad_actions_and_arguments_are_refused():
             TwoFetchEnv(**arguments)
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_continues_the_episode_with_its_bits(duplicate, rng):
     env = TwoFetchEnv("pick-and-place")
     env.reset(seed=2)

@@ -92,7 +92,11 @@ def test_bad_actions_are_refused_and_move_no_environment():
     envs.reset(seed=1)
     bad = np.zeros((2, 3))
     bad[1, 2] = np.nan
-    for actions, message in [(bad, "environment 1"), (np.zeros((2, 4)), r"\(2, 4\), expected \(2, 3\)")]:
+    for actions, message in [
+        (bad, "environment 1"),
+        (np.zeros((2, 4)), r"\(2, 4\), expected \(2, 3\)"),
+        (np.zeros(6), r"\(6,\), expected \(2, 3\)"),
+    ]:
         with pytest.raises(ValueError, match=message):
             envs.step(actions)
     after = envs.step(np.ones((2, 3)))[0]["observation"]
@@ -107,6 +111,19 @@ def test_arguments_out_of_range_are_refused():
             tandem.TandemVectorEnv(**arguments)
     with pytest.raises(ValueError, match="seeds has length 1"):
         tandem.TandemVectorEnv(2).reset(seed=[1])
+    with pytest.raises(ValueError, match="the seed of environment 1 is 18446744073709551616"):
+        tandem.TandemVectorEnv(2).reset(seed=2**64 - 1)
+
+
+def test_an_environment_without_a_seed_of_its_own_continues():
+    envs, other = (tandem.TandemVectorEnv(2, "push", 1) for _ in range(2))
+    unseeded = envs.reset(seed=[1, None])[0]["observation"][1]
+    assert not np.array_equal(unseeded, other.reset(seed=[1, 0])[0]["observation"][1])
+    for each in (envs, other):
+        each.reset(seed=[4, 5])
+    observations = envs.reset(seed=[7, None])[0]["observation"]
+    assert np.array_equal(observations[1], other.reset()[0]["observation"][1])
+    assert np.array_equal(observations[0], other.reset(seed=7)[0]["observation"][0])
 
 
 def test_every_environment_is_drawn():
@@ -118,7 +135,7 @@ def test_every_environment_is_drawn():
     assert len(pictures) == 2 and np.array_equal(pictures[1], single.render())
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_copied_environments_continue_their_episodes_with_the_same_bits(mode, duplicate, rng):
     envs = tandem.TandemVectorEnv(3, "push", 1, max_episode_steps=6, autoreset_mode=mode, substeps=10)

@@ -27,6 +27,7 @@ class Entry:
 
 
 SERVED = "python/tests/test_environment_server.py"
+PAIR = "python/tests/test_two_fetch.py"
 REPLAYED = "worker/tests/services/environments.rs"
 ELSEWHERE = [
     # Programs that need another machine, a registry or hardware.
@@ -50,7 +51,8 @@ ELSEWHERE = [
     Entry("python -m tandem.serve", "needs the Python package", SERVED),
     Entry("tandem eval --policy FILE", "needs MuJoCo", SERVED, "docs/environments.md"),
     Entry("tandem train --env-command 'python -m tandem.serve FetchPush-v4'", "needs MuJoCo", SERVED),
-    Entry("tandem train --env-command 'python -m tandem.serve tandem/TwoFetchPush-v0'", "needs MuJoCo", SERVED),
+    Entry("tandem train --env-command 'python -m tandem.serve FetchPush-v4 --reflection fetch'", "needs MuJoCo", PAIR),
+    Entry("tandem train --env-command 'python -m tandem.serve tandem/TwoFetchPush-v0'", "needs MuJoCo", PAIR),
     Entry("python scripts/benchmarks.py run", "trains for hours", ""),
     Entry("python scripts/benchmarks.py composed", "evaluates a teacher that takes hours", ""),
     Entry("python scripts/benchmarks.py collect", "collects what took hours", ""),
