@@ -21,15 +21,18 @@ async function stop() {
   button.classList.add("pressed");
   result.className = "stop-result";
   setText(result, "Stopping …");
+  // Not `AbortSignal.timeout`, which old browsers lack: the request must be sent in any case.
+  const abort = new AbortController();
+  const timer = setTimeout(() => abort.abort(), STOP_TIMEOUT_MS);
   try {
     const response = await fetch("/stop", {
       method: "POST",
       headers: { "x-tandem-action": "stop" },
-      signal: AbortSignal.timeout(STOP_TIMEOUT_MS),
+      signal: abort.signal,
     });
     if (response.status === 401) return location.reload();
     const answer = await response.json().catch((error) => {
-      if (error.name === "TimeoutError") throw error;
+      if (error.name === "AbortError") throw error;
       return {};
     });
     if (!response.ok) throw new Error(answer.problem ?? `the bridge answers ${response.status}`);
@@ -37,10 +40,11 @@ async function stop() {
     result.className = "stop-result confirmed";
     setText(result, `Stopped ${answer.stopped}`);
   } catch (error) {
-    const problem = error.name === "TimeoutError" ? "no answer" : error.message;
+    const problem = error.name === "AbortError" ? "no answer" : error.message;
     result.className = "stop-result failed";
     setText(result, `The stop is not confirmed: ${problem}. Use the emergency stop.`);
   } finally {
+    clearTimeout(timer);
     button.classList.remove("pressed");
   }
 }
@@ -226,20 +230,21 @@ function show(s) {
 }
 
 function showLink() {
-  const isOld = link === "live" && state && sinceHeard() > STALE_MS;
+  const isOld = link !== "lost" && state && sinceState() > STALE_MS;
+  const age = `no state for ${Math.round(sinceState() / 1000)} s`;
   const element = byId("link");
   element.classList.toggle("lost", link === "lost" || isOld);
   document.body.classList.toggle("stale", link === "lost" || isOld);
-  setText(element, isOld ? `no state for ${Math.round(sinceHeard() / 1000)} s` : {
-    live: "live",
+  setText(element, {
+    live: isOld ? age : "live",
     lost: "no connection: the values are old; trying again",
-    full: "too many viewers, trying again; the stop button works",
+    full: `too many viewers, trying again; the stop button works${isOld ? `; ${age}` : ""}`,
   }[link] ?? link);
 }
 
-const sinceHeard = follow(show, (condition) => {
+const { sinceState } = follow(show, (condition) => {
   // A bridge that starts again may begin with other versions.
-  if (condition === "live" && link === "lost") logVersion = null;
+  if (condition === "live") logVersion = null;
   if (condition === "lost") document.title = "No connection – Tandem bridge";
   link = condition;
   showLink();

@@ -54,9 +54,12 @@ export class Chart {
     this.drawLegend();
   }
 
+  /** Shows other rows; the cursor stays at its steps. */
   show(rows) {
+    const steps = this.rows[this.cursor]?.env_steps;
     this.rows = rows;
-    this.cursor = null;
+    const kept = rows.findIndex((row) => row.env_steps === steps);
+    this.cursor = kept < 0 ? null : kept;
     this.draw();
   }
 

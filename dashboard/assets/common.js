@@ -2,6 +2,14 @@
 
 /** Time after which a hidden page closes its connection, milliseconds. */
 const HIDDEN_MS = 5000;
+/** Time that the browser has to open an interrupted connection again before it counts as lost, milliseconds. */
+const GRACE_MS = 1000;
+/** Time between two attempts to open a lost connection, milliseconds. */
+const RETRY_MS = 2000;
+/** Silence after which a connection is opened again: the service sends something every few seconds. Milliseconds. */
+const REOPEN_MS = 30_000;
+/** Silence after which a page says that its values are old, milliseconds. */
+const SILENT_MS = 10_000;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -61,42 +69,72 @@ export async function fetchJson(path) {
 }
 
 /**
- * Calls `onState` with every state, and `onLink` with the condition of the connection: "live", "lost" or "full".
+ * Calls `onState` with every state, and `onLink` with the condition of the connection: "live", "lost" or "full"; "live"
+ * each time that a connection is opened, possibly to a service that has been started again. The service ends connections
+ * at a certain age, and the browser opens another one at once, so "lost" is reported only if that fails.
  * A lost connection is opened again for as long as the page exists. A hidden page closes it after a while: browsers open
  * six connections to an address, and the stop button of another page needs one.
+ *
+ * Returns functions of the time since the latest state and since the latest sign of the service, milliseconds.
  */
 export function follow(onState, onLink) {
   let source = null;
-  let heardAt = performance.now();
+  let timer = null;
   let hidden = null;
+  let stateAt = performance.now();
+  let aliveAt = stateAt;
+  let openedAt = stateAt;
+  const wait = (action, time_ms) => {
+    clearTimeout(timer);
+    timer = action && setTimeout(action, time_ms);
+  };
   const close = () => {
+    wait(null);
     source?.close();
     source = null;
   };
   const open = () => {
     close();
     if (document.hidden) return;
+    openedAt = performance.now();
     source = new EventSource("/events");
     source.onopen = () => {
-      heardAt = performance.now();
+      wait(null);
+      stateAt = aliveAt = performance.now();
       onLink("live");
     };
     source.onmessage = (message) => {
-      heardAt = performance.now();
+      stateAt = aliveAt = performance.now();
       onState(JSON.parse(message.data));
     };
-    source.onerror = async () => {
-      const isClosed = source.readyState === EventSource.CLOSED;
-      onLink("lost");
-      if (!isClosed) return;
-      // The browser gives up after a response that is no stream: the reason is in the response.
-      const status = await fetch("/state").then((response) => response.status, () => 0);
-      if (status === 401) location.reload();
-      if (status === 200) onLink("full");
-      setTimeout(open, 2000);
+    source.addEventListener("alive", () => {
+      aliveAt = performance.now();
+    });
+    source.onerror = (event) => {
+      if (event.target.readyState === EventSource.CLOSED) return refused(event.target);
+      if (timer === null) wait(lose, GRACE_MS);
     };
   };
+  const lose = () => {
+    close();
+    onLink("lost");
+    wait(open, RETRY_MS);
+  };
+  // The browser gives up after a response that is no stream: the reason is in the response.
+  const refused = async (closed) => {
+    wait(null);
+    onLink("lost");
+    const status = await fetch("/state").then((response) => response.status, () => 0);
+    if (source !== closed) return;
+    if (status === 401) location.reload();
+    if (status === 200) onLink("full");
+    wait(open, RETRY_MS);
+  };
   open();
+  // A connection whose other end is gone raises no error.
+  setInterval(() => {
+    if (source !== null && performance.now() - Math.max(aliveAt, openedAt) > REOPEN_MS) open();
+  }, 1000);
   addEventListener("pagehide", close);
   addEventListener("pageshow", (event) => event.persisted && open());
   document.addEventListener("visibilitychange", () => {
@@ -107,7 +145,7 @@ export function follow(onState, onLink) {
       onLink("lost");
     }, HIDDEN_MS);
   });
-  return () => performance.now() - heardAt;
+  return { sinceState: () => performance.now() - stateAt, sinceAlive: () => performance.now() - aliveAt };
 }
 
 /** Replaces the children of `parent` by one element per item, and keeps elements whose key is the same. */
@@ -169,10 +207,15 @@ export class Documents {
   }
 }
 
-/** Shows the condition of the connection; `hasEnded` if the service is expected to be gone. */
-export function showLink(element, condition, hasEnded) {
-  element.classList.toggle("lost", condition === "lost" && !hasEnded);
-  setText(element, {
+/**
+ * Shows the condition of the connection, which has been silent for `silent_ms`; `hasEnded` if the service is expected to
+ * be gone.
+ */
+export function showLink(element, condition, hasEnded, silent_ms) {
+  const isSilent = condition === "live" && !hasEnded && silent_ms > SILENT_MS;
+  element.classList.toggle("lost", isSilent || (condition === "lost" && !hasEnded));
+  // In steps, which screen readers repeat.
+  setText(element, isSilent ? `nothing received for ${10 * Math.floor(silent_ms / 10_000)} s: the values are old` : {
     live: "live",
     lost: hasEnded ? "the service has ended; these are the final values" : "no connection, trying again",
     full: "too many viewers, trying again",

@@ -15,20 +15,32 @@ export class Player {
     this.playback = null;
     this.step = 0;
     this.playing = false;
-    byId("play").addEventListener("click", () => (this.playing ? this.pause() : this.start()));
+    /** Whether the viewer has paused: then nothing moves until the viewer asks for it. */
+    this.isHeld = false;
+    byId("play").addEventListener("click", () => {
+      this.isHeld = this.playing;
+      if (this.playing) this.pause();
+      else this.start();
+    });
     byId("step").addEventListener("input", (event) => {
+      this.isHeld = true;
       this.pause();
       this.seek(Number(event.target.value));
     });
     byId("episode-choice").addEventListener("change", (event) => this.choose(Number(event.target.value)));
   }
 
-  /** Shows the episodes of an evaluation, `null` if it has none that can be shown. */
+  /** Shows the episodes of an evaluation, `null` if it has none that can be shown. Those that are shown already go on. */
   load(playback) {
+    if (playback && JSON.stringify(playback) === JSON.stringify(this.playback)) return;
     this.playback = playback;
     byId("player").hidden = !playback;
     byId("episode-note").hidden = Boolean(playback);
-    if (!playback) return;
+    if (!playback) {
+      this.pause();
+      this.episode = null;
+      return;
+    }
     const choice = byId("episode-choice");
     const chosen = Math.min(Number(choice.value) || 0, playback.episodes.length - 1);
     choice.replaceChildren(...playback.episodes.map((episode, idx) =>
@@ -42,7 +54,7 @@ export class Player {
     byId("step").max = this.episode.steps.length - 1;
     this.views = [this.view("view-above", 1), this.view("view-side", 2)];
     this.seek(0);
-    if (matchMedia("(prefers-reduced-motion: reduce)").matches) this.pause();
+    if (this.isHeld || matchMedia("(prefers-reduced-motion: reduce)").matches) this.pause();
     else this.start();
   }
 

@@ -10,9 +10,14 @@ const player = new Player();
 let state = null;
 let link = "connecting";
 let latest = null;
+/** The evaluations, and whether the latest one has episodes to play; `null` until they are loaded. */
+let evaluations = null;
+let hasPlayback = null;
 
 /** Returns `value` for rows after the first update: before it there is no loss, and no Q of a trained critic. */
 const learned = (value) => (row) => (row.updates > 0 ? value(row) : null);
+/** Returns the success in training, which the row of the initial policy does not have. */
+const trained = (row) => (row.episodes > 0 ? row.training_success : null);
 
 const charts = [
   new Chart(byId("success-chart"), {
@@ -26,7 +31,7 @@ const charts = [
     series: [
       { name: "success", class: "first", value: (row) => row.success, low: (row) => row.success_low, high: (row) => row.success_high },
       { name: "without contact between arms", class: "second", value: (row) => row.success_without_contact },
-      { name: "training", class: "third", value: (row) => row.training_success },
+      { name: "training", class: "third", value: trained },
     ],
   }),
   new Chart(byId("q-chart"), {
@@ -66,18 +71,25 @@ function tiles(s) {
   ].filter(Boolean);
 }
 
+/** Returns the word and the colour for the end of a run. */
+function ending(end) {
+  if (!end.interrupted) return { word: "complete", level: "good" };
+  return end.digest === null ? { word: "failed", level: "bad" } : { word: "stopped", level: "warning" };
+}
+
 function showHeader(s) {
   setText(byId("name"), s.run || "Run");
   document.title = `${s.run || "Run"} – Tandem`;
   setText(byId("terms"), `${s.task}, ${plural(s.n_arms, "arm")}, strategy ${s.strategy}, seed ${s.seed}`);
   const phase = byId("phase");
-  const ended = s.end;
-  setText(phase, ended ? (ended.interrupted ? "stopped" : "complete") : s.phase || "starting");
-  phase.className = `badge ${ended ? (ended.interrupted ? "warning" : "good") : ""}`;
+  const ended = s.end && ending(s.end);
+  setText(phase, ended ? ended.word : s.phase || "starting");
+  phase.className = `badge ${ended ? ended.level : ""}`;
   setText(byId("clock"), `${clock(s.wall_s)} elapsed, round ${count(s.round)}`);
   const alert = byId("alert");
-  alert.hidden = !s.warning;
-  setText(alert, s.warning);
+  const problem = [ended?.level === "bad" && `The run has failed: ${s.end.reason}`, s.warning].filter(Boolean).join("; ");
+  alert.hidden = !problem;
+  setText(alert, problem);
   showProgress(s);
 }
 
@@ -96,7 +108,9 @@ function showProgress(s) {
     });
   }
   byId("progress").hidden = ends.length === 0;
-  if (ends.length === 0) return setText(byId("progress-text"), "This run has no limit of steps or minutes.");
+  const verbs = { complete: "Ended", stopped: "Stopped", failed: "Failed" };
+  const end = s.end ? `. ${verbs[ending(s.end).word]}: ${s.end.reason}` : "";
+  if (ends.length === 0) return setText(byId("progress-text"), `This run has no limit of steps or minutes${end || "."}`);
   const done = Math.min(1, Math.max(...ends.map((end) => end.share)));
   byId("bar").style.width = `${100 * done}%`;
   byId("progress").setAttribute("aria-valuenow", Math.round(100 * done));
@@ -104,7 +118,6 @@ function showProgress(s) {
   // The run ends at the first of its limits.
   const left = Math.min(...ends.map((end) => end.left).filter(Number.isFinite));
   const remaining = s.end || !(left > 0) || !Number.isFinite(left) ? "" : `, about ${clock(left)} left`;
-  const end = s.end ? `. ${s.end.interrupted ? "Stopped" : "Ended"}: ${s.end.reason}` : "";
   setText(byId("progress-text"), `${limit}${remaining}${end}`);
 }
 
@@ -202,12 +215,20 @@ function showServices(s) {
 function showTable(rows) {
   const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
   const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
-    percent(row.success_without_contact), percent(row.training_success),
+    percent(row.success_without_contact), percent(trained(row)),
     ...["mean_q", "critic_loss", "actor_loss"].map((name) => real(learned((it) => it[name])(row))),
     count(row.advice_spent)];
   byId("success-table").replaceChildren(
     el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),
     el("tbody", {}, [...rows].reverse().map((row) => el("tr", {}, cells(row).map((cell) => el("td", {}, cell))))));
+}
+
+/** Says why there is no episode to play. */
+function showEpisodeNote() {
+  if (evaluations === null || hasPlayback !== false) return;
+  setText(byId("episode-note"), evaluations.length === 0 ? "The first evaluation has not been completed yet."
+    : state.has_episodes ? "The goals of this task are not points, so its episodes are not drawn."
+    : "The episodes of the latest evaluation were not kept when the learner was started again.");
 }
 
 function show(s) {
@@ -218,17 +239,27 @@ function show(s) {
   showAdvice(s);
   showServices(s);
   documents.update("evaluations", s.versions.evaluations, (rows) => {
+    evaluations = rows;
     latest = rows.at(-1);
     charts.forEach((chart) => chart.show(rows));
     showTable(rows);
     showTiles(byId("tiles"), tiles(state));
+    showEpisodeNote();
   });
-  documents.update("playback", s.versions.playback, (playback) => player.load(playback));
+  if (documents.versions.playback !== s.versions.playback) hasPlayback = null;
+  documents.update("playback", s.versions.playback, (playback) => {
+    hasPlayback = playback !== null;
+    player.load(playback);
+    showEpisodeNote();
+  });
   documents.update("log", s.versions.log, (events) => showLog(byId("log"), events));
 }
 
-follow(show, (condition) => {
-  if (condition === "live" && link === "lost") documents.forget();
+const showCondition = () => showLink(byId("link"), link, state?.end, sinceAlive());
+
+const { sinceAlive } = follow(show, (condition) => {
+  if (condition === "live") documents.forget();
   link = condition;
-  showLink(byId("link"), condition, state?.end);
+  showCondition();
 });
+setInterval(showCondition, 1000);

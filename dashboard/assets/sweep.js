@@ -35,13 +35,16 @@ function tiles(s) {
   ];
 }
 
+/** The colours of the ends of a sweep; further ones are failures. */
+const ENDS = { complete: "good", interrupted: "warning" };
+
 function showHeader(s) {
   setText(byId("name"), s.name || "Sweep");
   document.title = `${s.name || "Sweep"} – Tandem`;
   setText(byId("terms"), `${plural(s.n_runs, "run")} in ${s.directory}`);
   const phase = byId("phase");
   setText(phase, s.end || "running");
-  phase.className = `badge ${s.end === "complete" ? "good" : s.end ? "warning" : ""}`;
+  phase.className = `badge ${s.end ? ENDS[s.end] ?? "bad" : ""}`;
   setText(byId("clock"), `${clock(s.wall_s)} since its start`);
   const isLimited = s.max_env_steps > 0;
   const done = isLimited ? Math.min(1, s.env_steps / s.max_env_steps) : counted("finished") / Math.max(1, s.n_runs);
@@ -171,8 +174,11 @@ function show(s) {
 
 byId("task").addEventListener("change", showCurves);
 
-follow(show, (condition) => {
-  if (condition === "live" && link === "lost") documents.forget();
+const showCondition = () => showLink(byId("link"), link, state?.end, sinceAlive());
+
+const { sinceAlive } = follow(show, (condition) => {
+  if (condition === "live") documents.forget();
   link = condition;
-  showLink(byId("link"), condition, state?.end);
+  showCondition();
 });
+setInterval(showCondition, 1000);

@@ -155,15 +155,40 @@ fn problems(former: &RunView, view: &RunView, new: &mut New) {
             }
         }
     }
-    if former.warning != view.warning {
-        new.push(match view.warning.is_empty() {
-            true => (Level::Good, "The problem is solved".to_owned()),
-            false => (Level::Bad, sentence(&view.warning)),
+    match warnings(&former.warning, &view.warning) {
+        Warnings::New(texts) => {
+            new.extend(texts.into_iter().map(|text| (Level::Bad, sentence(text))));
+        }
+        Warnings::Solved(texts) => {
+            new.extend(texts.into_iter().map(|text| (Level::Good, format!("Solved: {text}"))));
+        }
+    }
+    if let (None, Some(EndView { reason, interrupted, digest })) = (&former.end, &view.end) {
+        new.push(match (interrupted, digest) {
+            (true, None) => (Level::Bad, format!("The run has failed: {reason}")),
+            (true, Some(_)) => (Level::Warning, format!("The run has ended: {reason}")),
+            (false, _) => (Level::Good, format!("The run has ended: {reason}")),
         });
     }
-    if let (None, Some(EndView { reason, interrupted, .. })) = (&former.end, &view.end) {
-        let level = if *interrupted { Level::Warning } else { Level::Good };
-        new.push((level, format!("The run has ended: {reason}")));
+}
+
+/// The change of a list of warnings.
+pub(crate) enum Warnings<'a> {
+    /// Warnings that were not there before; they may replace others.
+    New(Vec<&'a str>),
+    /// Warnings that are gone, if there is no new one.
+    Solved(Vec<&'a str>),
+}
+
+/// Compares two lists of warnings, which are joined by semicolons.
+pub(crate) fn warnings<'a>(before: &'a str, now: &'a str) -> Warnings<'a> {
+    let only_in = |these: &'a str, others: &'a str| -> Vec<&'a str> {
+        let is_other = |text: &&str| others.split("; ").any(|other| other == *text);
+        these.split("; ").filter(|text| !text.is_empty() && !is_other(text)).collect()
+    };
+    match only_in(now, before) {
+        new if new.is_empty() => Warnings::Solved(only_in(before, now)),
+        new => Warnings::New(new),
     }
 }
 
@@ -232,13 +257,32 @@ mod tests {
         let texts = events_of(&mut log, &mut view, |view| "no disk".clone_into(&mut view.warning));
         assert_eq!(texts, "No disk");
         assert_eq!(events_of(&mut log, &mut view, |_| ()), "");
-        let texts = events_of(&mut log, &mut view, |view| view.warning.clear());
-        assert_eq!(texts, "The problem is solved");
+        let mut warn = |warning: &str| {
+            events_of(&mut log, &mut view, |view| warning.clone_into(&mut view.warning))
+        };
+        assert_eq!(warn("no disk; no teacher"), "No teacher");
+        assert_eq!(warn("no teacher"), "Solved: no disk");
+        assert_eq!(warn("no answer"), "No answer");
+        assert_eq!(warn(""), "Solved: no answer");
         let texts = events_of(&mut log, &mut view, |view| {
             let reason = "done".to_owned();
             view.end = Some(EndView { reason, interrupted: false, digest: None });
         });
         assert_eq!(texts, "The run has ended: done");
+    }
+
+    #[test]
+    fn an_error_is_not_reported_like_a_stop() {
+        let check = |digest: Option<&str>, expected: Level| {
+            let (mut log, mut view) = (EventLog::default(), RunView::default());
+            log.update(&view);
+            let digest = digest.map(str::to_owned);
+            view.end = Some(EndView { reason: "it".to_owned(), interrupted: true, digest });
+            log.update(&view);
+            assert_eq!(log.events().back().expect("events").level, expected);
+        };
+        check(Some("00"), Level::Warning);
+        check(None, Level::Bad);
     }
 
     #[test]

@@ -126,7 +126,7 @@ fn views(text_id: &str) -> Markup {
 /// Returns the two views of an episode and its controls.
 fn episode() -> Markup {
     html! {
-        p #episode-note .note { "The first evaluation has not been completed yet." }
+        p #episode-note .note {}
         div #player hidden {
             (views("episode-text"))
             div .controls {

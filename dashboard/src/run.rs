@@ -33,6 +33,8 @@ struct State<'a> {
     n_workers: usize,
     /// Number of workers that take part.
     n_active_workers: usize,
+    /// Whether the learner has episodes of the latest evaluation, also those that cannot be played.
+    has_episodes: bool,
     versions: Versions,
 }
 
@@ -98,12 +100,14 @@ impl Feed {
     fn state(&self, view: &RunView) -> Arc<str> {
         let n_active_workers = view.workers.iter().filter(|it| it.state.is_active()).count();
         let (n_workers, versions) = (view.workers.len(), self.versions);
+        let has_episodes = !view.evaluated.is_empty();
+        let state = State { view, n_workers, n_active_workers, has_episodes, versions };
         if n_workers <= MAX_WORKERS {
-            return encode(&State { view, n_workers, n_active_workers, versions });
+            return encode(&state);
         }
         let listed = view.workers[..MAX_WORKERS].to_vec();
         let view = &RunView { workers: listed, ..view.clone() };
-        encode(&State { view, n_workers, n_active_workers, versions })
+        encode(&State { view, ..state })
     }
 }
 

@@ -6,11 +6,11 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Router;
 use axum::extract::{Path, State};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{Html, IntoResponse as _, Response};
 use axum::routing::{get, post};
+use axum::{Extension, Router};
 use http::StatusCode;
 use http::header::CONTENT_TYPE;
 use serde::Serialize;
@@ -20,8 +20,10 @@ use tokio_stream::wrappers::WatchStream;
 
 use crate::access::{self, Access};
 
-/// Time without an event after which a comment is sent, so that a viewer that is gone is noticed.
-const KEEP_ALIVE: Duration = Duration::from_secs(10);
+/// Time without a state after which an event `alive` is sent, so that both sides notice when the other one is gone.
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
+/// Time after which browsers open a stream again that has ended.
+const RETRY_AFTER: Duration = Duration::from_millis(200);
 
 /// The result of a stop: the description of the stop that the arms are in, or of the problem.
 pub type StopResult = Result<String, String>;
@@ -60,6 +62,10 @@ const ASSETS: [(&str, &str, &str); 8] = [
     ("sweep.js", "text/javascript; charset=utf-8", include_str!("../assets/sweep.js")),
     ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
 ];
+
+/// Becomes true when the connection of a request has to end.
+#[derive(Clone)]
+pub(crate) struct Expiry(pub(crate) watch::Receiver<bool>);
 
 /// The state of the routes.
 #[derive(Clone)]
@@ -125,17 +131,26 @@ async fn asset(Path(name): Path<String>) -> Response {
     })
 }
 
-/// Streams the states. A viewer that is slower than they change misses those in between.
-async fn events(State(served): State<Served>) -> Response {
+/// Streams the states until the connection expires. A viewer that is slower than they change misses those in between.
+async fn events(
+    State(served): State<Served>,
+    Extension(Expiry(expiry)): Extension<Expiry>,
+) -> Response {
     let Ok(permit) = served.viewers.try_acquire_owned() else {
         let text = "too many viewers: close another page of this dashboard\n";
         return (StatusCode::SERVICE_UNAVAILABLE, text).into_response();
     };
+    let mut first = Some(Event::default().retry(RETRY_AFTER));
     let states = WatchStream::new(served.site.frames).map(move |frame| {
         let _held = &permit;
-        Ok::<_, Infallible>(Event::default().data(&*frame.state))
+        Some(Ok::<_, Infallible>(first.take().unwrap_or_default().data(&*frame.state)))
     });
-    Sse::new(states).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
+    let end = WatchStream::new(expiry).filter(|is_old| *is_old).map(|_| None);
+    // The stream ends with the first `None`.
+    let states = states.chain(tokio_stream::once(None)).merge(end).map_while(|event| event);
+    let alive = KeepAlive::new().interval(KEEP_ALIVE);
+    let alive = alive.event(Event::default().event("alive").data("-"));
+    Sse::new(states).keep_alive(alive).into_response()
 }
 
 /// Stops the arms of a bridge. `access` has checked that a page of another server did not ask for it.

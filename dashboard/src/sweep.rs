@@ -7,7 +7,7 @@ use serde::Serialize;
 use tandem_telemetry::MetricsRow;
 use tokio::sync::watch;
 
-use crate::events::{Event, Level};
+use crate::events::{Event, Level, Warnings, warnings};
 use crate::page;
 use crate::site::{Frame, Site, encode};
 
@@ -271,12 +271,21 @@ fn news(former: Option<&SweepView>, view: &SweepView) -> Vec<(Level, String)> {
         if before.state != now.state {
             news.extend(change(now));
         }
-        if before.pace.warning != now.pace.warning && !now.pace.warning.is_empty() {
-            news.push((Level::Warning, format!("{}: {}", now.name, now.pace.warning)));
+        let name = &now.name;
+        match warnings(&before.pace.warning, &now.pace.warning) {
+            Warnings::New(texts) => news
+                .extend(texts.into_iter().map(|text| (Level::Warning, format!("{name}: {text}")))),
+            // The warnings of a run that has ended are gone, but not solved.
+            Warnings::Solved(texts) if now.state == SweepRunState::Running => news.extend(
+                texts.into_iter().map(|text| (Level::Good, format!("{name}: solved: {text}"))),
+            ),
+            Warnings::Solved(_) => {}
         }
     }
     if former.end != view.end && !view.end.is_empty() {
-        news.push((Level::Info, format!("The sweep has ended: {}", view.end)));
+        let has_failed = view.runs.iter().any(|run| run.state == SweepRunState::Failed);
+        let level = if has_failed { Level::Bad } else { Level::Info };
+        news.push((level, format!("The sweep has ended: {}", view.end)));
     }
     news
 }

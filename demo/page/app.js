@@ -25,15 +25,22 @@ class App {
     this.times = [];
     this.n_steps = 0;
     this.n_choices = 0;
-    this.isReady = false;
     this.bind();
+    this.setReady(false, "Loading");
+  }
+
+  /** Enables the controls of the student once there is one; until then, the badge says `instead`. */
+  setReady(isReady, instead) {
+    this.isReady = isReady;
+    this.instead = instead;
+    for (const id of ["play", "restart", "next", "compute"]) $(id).disabled = !isReady;
+    if (!isReady && this.isLive) show(badge, instead, "");
   }
 
   /** Loads the student of a task. */
   async choose(task) {
     const choice = ++this.n_choices;
-    this.isReady = false;
-    show(badge, "Loading", "");
+    this.setReady(false, "Loading");
     try {
       const response = await fetch(`student-${task}.safetensors.gz`);
       if (!response.ok) throw new Error(`the policy: ${response.status} ${response.statusText}`);
@@ -47,7 +54,7 @@ class App {
     } catch (error) {
       if (choice !== this.n_choices) return;
       // The student before, if there is one, plays on.
-      this.isReady = this.task !== undefined;
+      this.setReady(this.task !== undefined, "Not loaded");
       for (const radio of tasks()) radio.checked = radio.value === this.task;
       if (this.status) this.update(this.status);
       throw error;
@@ -56,7 +63,7 @@ class App {
 
   load() {
     this.facts = this.simulator.read("load_policy", this.policy, this.start);
-    this.isReady = true;
+    this.setReady(true);
     $("heights").hidden = !this.facts.grasps;
     for (const arm of [0, 1]) [$(`height-${arm}`).min, $(`height-${arm}`).max] = this.facts.heights_m;
     this.restart();
@@ -74,7 +81,8 @@ class App {
   frame(now_ms) {
     const elapsed_s = Math.min((now_ms - (this.last_ms ?? now_ms)) / 1000, 0.5);
     this.last_ms = now_ms;
-    if (this.isReady) {
+    // A log needs no student.
+    if (this.isReady || !this.isLive) {
       try {
         if (this.isLive) this.advance(elapsed_s, now_ms);
         else this.log.advance(elapsed_s);
@@ -113,17 +121,19 @@ class App {
   recover(error) {
     complain(error);
     if (error instanceof Refused) {
-      this.restart();
+      if (this.isReady) this.restart();
       return;
     }
     this.simulator.start();
     this.leaveLog();
-    this.load();
+    if (this.policy) this.load();
   }
 
   update(status) {
     const wasSuccess = this.status?.is_success;
     this.status = status;
+    // The values are those of a log.
+    if (!this.isLive) return;
     const step_s = this.facts.control_step_s;
     showDistances(status.distances_m, this.facts.tolerance_m);
     for (const [arm, goal] of status.goals.entries()) {
@@ -259,7 +269,7 @@ class App {
   /** Starts the simulator again after a file that made it trap. */
   recoverFromLog() {
     this.simulator.start();
-    this.load();
+    if (this.policy) this.load();
   }
 
   verdict(facts, name) {
@@ -298,6 +308,7 @@ class App {
     $("second-tile").hidden = false;
     this.times = [];
     if (this.status) this.update(this.status);
+    else show(badge, this.instead, "");
     this.screen.isStale = true;
   }
 
@@ -319,7 +330,7 @@ class App {
       $("digests").hidden = false;
       showVerdict("digest-verdict", here === native ? "Equal: 1,000 steps, every bit" : "The hashes differ", here === native);
     } finally {
-      $("compute").disabled = false;
+      $("compute").disabled = !this.isReady;
       $("compute").textContent = "Compute it here";
     }
   }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use tandem_core::Episode;
 
 use crate::metrics::MetricsRow;
@@ -21,7 +21,8 @@ pub struct RunView {
     pub n_arms: usize,
     /// Advising strategy.
     pub strategy: String,
-    /// Seed of the run.
+    /// Seed of the run; a text in JSON, because numbers of pages are exact up to 2^53 only.
+    #[serde(serialize_with = "as_text")]
     pub seed: u64,
     /// The current activity: "starting", "collecting", "updating", "evaluating" or "ended"; empty until the run is
     /// loaded.
@@ -82,6 +83,11 @@ pub struct RunView {
     /// The first episodes of the latest evaluation.
     #[serde(skip)]
     pub evaluated: Arc<[Episode]>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "required by serde")]
+fn as_text<S: Serializer>(number: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(number)
 }
 
 /// Training steps of one arm by who acted.

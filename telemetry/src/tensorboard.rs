@@ -122,6 +122,9 @@ fn events(rows: &[MetricsRow], started_s: f64) -> impl Iterator<Item = Event> {
 #[expect(clippy::cast_possible_truncation, reason = "TensorBoard's scalars have 32 bits")]
 fn values(row: &MetricsRow) -> Vec<Value> {
     let contacts = &row.contacts;
+    // The row of the initial policy has zeros for what has not been measured yet.
+    let trained = |value: f64| (row.episodes > 0).then_some(value);
+    let learned = |value: f64| (row.updates > 0).then_some(value);
     let known = [
         ("evaluation/success", Some(row.success)),
         ("evaluation/success_low", Some(row.success_low)),
@@ -137,11 +140,11 @@ fn values(row: &MetricsRow) -> Vec<Value> {
         ("evaluation/avoidance_rate", contacts.avoidance_rate),
         ("evaluation/moved", Some(row.moved)),
         ("evaluation/return", Some(row.mean_return)),
-        ("training/success", Some(row.training_success)),
-        ("training/moved", Some(row.training_moved)),
-        ("q/mean", Some(row.mean_q)),
-        ("loss/critic", Some(row.critic_loss)),
-        ("loss/actor", Some(row.actor_loss)),
+        ("training/success", trained(row.training_success)),
+        ("training/moved", trained(row.training_moved)),
+        ("q/mean", learned(row.mean_q)),
+        ("loss/critic", learned(row.critic_loss)),
+        ("loss/actor", learned(row.actor_loss)),
         ("advice/spent", Some(row.advice_spent as f64)),
         ("advice/queries", row.advice_queries.map(|queries| queries as f64)),
         ("advice/left", Some(row.budget_left as f64)),
@@ -188,6 +191,8 @@ mod tests {
             wall_s: *round as f64 * 2.5,
             success: *round as f64 / 100.0,
             success_per_arm: vec![0.5, 0.75],
+            episodes: round * 32,
+            updates: round * 40,
             mean_q: f64::NAN,
             ..MetricsRow::default()
         };
@@ -241,6 +246,17 @@ mod tests {
         assert_eq!(value("evaluation/success_arm_1"), Some(0.75));
         assert_eq!(value("q/mean"), None, "not a number");
         assert_eq!(value("evaluation/arm_contact_rate"), None, "not known");
+        assert_eq!(value("loss/critic"), Some(0.0));
+        assert_eq!(value("training/success"), Some(0.0));
+    }
+
+    #[test]
+    fn the_initial_policy_has_no_values_of_training() {
+        let tags: Vec<String> = values(&rows(&[0])[0]).into_iter().map(|it| it.tag).collect();
+        assert!(tags.contains(&"evaluation/success".to_owned()), "{tags:?}");
+        let is_measured =
+            |tag: &String| ["training/", "q/", "loss/"].iter().any(|of| tag.starts_with(of));
+        assert!(!tags.iter().any(is_measured), "{tags:?}");
     }
 
     #[test]

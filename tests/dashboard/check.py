@@ -188,6 +188,35 @@ def check_drawings(page):
     assert cut == [], cut
 
 
+def check_pause(page):
+    """An episode that is loaded again keeps its place, and a further one does not move for a viewer who has paused."""
+    kept = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
+      const player = new Player(), raised = {RAISED};
+      player.load(raised);
+      player.pause();
+      player.isHeld = true;
+      player.step = 0.5;
+      player.load(structuredClone(raised));
+      const step = player.step;
+      player.load({{ ...raised, round: 2 }});
+      return [step, player.step, player.playing];
+    }})""")
+    assert kept == [0.5, 0, False], kept
+    text = page.value("""import('/assets/common.js').then(({ showLink }) => {
+      const element = document.createElement('span');
+      showLink(element, 'live', null, 25_000);
+      return `${element.textContent} ${element.className}`;
+    })""")
+    assert text == "nothing received for 20 s: the values are old lost", text
+
+
+def check_errors(page):
+    """Scripts have no errors but those of a service that has ended."""
+    expected = "ERR_CONNECTION_REFUSED|ERR_CONNECTION_RESET|ERR_EMPTY_RESPONSE|ERR_INCOMPLETE_CHUNKED_ENCODING"
+    errors = [error for error in page.errors if not re.search(expected, str(error))]
+    assert not errors, errors
+
+
 def check_layout(page):
     """Nothing overflows, and everything has a name."""
     for _ in page.layouts():
@@ -221,8 +250,7 @@ def check_sweep(browser, program, directory, pictures):
         n_finished = "document.getElementById('log').textContent.split('is finished: success').length - 1"
         page.wait(f"{n_finished} === 4", "the log has the end of every run")
         assert process.wait(60) == 0
-        errors = [error for error in page.errors if not re.search("CONNECTION_REFUSED|INCOMPLETE_CHUNKED", str(error))]
-        assert not errors, errors
+        check_errors(page)
     finally:
         process.kill()
 
@@ -343,7 +371,9 @@ def main():
             check_episode(page)
             check_layout(page)
             page.take_pictures(args.pictures, "run")
-            check_drawings(browser.open(run.url))
+            drawings = browser.open(run.url)
+            check_drawings(drawings)
+            check_pause(drawings)
             measure_viewers(run)
             measure_cost(run)
             page.wait("document.hidden && document.getElementById('link').classList.contains('lost')", "a hidden page rests")
@@ -351,12 +381,12 @@ def main():
             page.wait("document.getElementById('link').textContent === 'live'", "the page is live again")
             run.process.send_signal(signal.SIGINT)
             page.wait("document.getElementById('phase').textContent === 'stopped'", "the end is shown", 30)
+            progress = page.value("document.getElementById('progress-text').textContent")
+            assert ". Stopped: " in progress, progress
             assert run.process.wait(60) == 130, run.lines
             page.wait("document.getElementById('link').textContent.includes('final values')", "the service has ended")
             page.take_pictures(args.pictures, "end")
-            errors = [error for error in page.errors if "ERR_CONNECTION_REFUSED" not in str(error)
-                      and "ERR_INCOMPLETE_CHUNKED_ENCODING" not in str(error)]
-            assert not errors, errors
+            check_errors(page)
         check_sweep(browser, args.program.resolve(), pathlib.Path(directory), args.pictures)
     print(f"the dashboards passed in {time.monotonic() - began:.0f} s")
 

@@ -12,6 +12,7 @@ import http.server
 import json
 import pathlib
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -264,6 +265,26 @@ def check_logs(page, logs):
     page.wait("document.getElementById('title').textContent === 'The student'", "the student is back")
 
 
+def check_without_student(browser, demo, directory, log):
+    """A page that cannot load its student says so, offers none of its controls, and plays a log."""
+    shutil.copytree(demo, directory, ignore=shutil.ignore_patterns("student-*"))
+    with Server(directory) as server:
+        page = browser.open(server.url)
+        page.wait("document.getElementById('badge').textContent === 'Not loaded'", "the page has no student")
+        controls = "['play', 'restart', 'next', 'compute'].every(id => document.getElementById(id).disabled)"
+        assert page.value(controls), "controls without a student"
+        verdict = drop(page, "student-push.mcap", log)
+        assert verdict == "50 of 50 steps equal bit for bit", verdict
+        page.wait("Number(document.getElementById('position').value) > 5", "the episode plays")
+        page.wait("(it => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.some(part => part > 0))"
+                  "(document.getElementById('canvas'))", "the episode is drawn")
+        page.value("document.getElementById('back').click()")
+        assert page.value("document.getElementById('badge').textContent") == "Not loaded"
+        errors = [error for error in page.errors if "404" not in str(error)]
+        assert not errors, errors
+        print("without a student, a log is played")
+
+
 def check_layout(page):
     """Nothing overflows or is cut off, and everything has a name."""
     for width in page.layouts():
@@ -297,6 +318,8 @@ def main():
             drop(page, "student-pick-and-place.mcap", logs["student-pick-and-place"])
             page.take_pictures(args.pictures, "log", pause_s=0.6)
             page.value("document.getElementById('back').click()")
+        check_without_student(browser, args.demo, pathlib.Path(directory, "demo"), logs["student-push"])
+        page.show()
         check_layout(page)
         check_digests(page, args.demo)
         page.take_pictures(args.pictures, "digest", pause_s=0.6)

@@ -126,6 +126,20 @@ async fn viewers_receive_the_state_and_every_change() {
 }
 
 #[tokio::test]
+async fn an_old_connection_ends_with_a_whole_response() {
+    let served = Served::start(Access::local()).await;
+    let mut viewer = served.send("GET /events", "").await;
+    let head = until(&mut viewer, "data: {").await;
+    assert!(head.contains("retry: 200\n"), "{head}");
+    // From here on, the clock advances by itself while everything waits.
+    tokio::time::pause();
+    let mut rest = String::new();
+    viewer.read_to_string(&mut rest).await.expect("UTF-8");
+    assert!(rest.contains("event: alive"), "{rest}");
+    assert!(rest.ends_with("\r\n0\r\n\r\n"), "{rest}");
+}
+
+#[tokio::test]
 async fn a_further_viewer_gets_a_sentence_and_the_others_are_served() {
     let served = Served::start(Access::local()).await;
     let mut viewers = Vec::new();

@@ -1,7 +1,8 @@
 //! Playback of the logs that become finished in a directory.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::os::unix::fs::DirEntryExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,8 +25,8 @@ pub struct Follower {
     address: SocketAddr,
     clock: Clock,
     directory: PathBuf,
-    /// Logs that were there at the start or were played.
-    seen: BTreeSet<PathBuf>,
+    /// Logs of the directory that were there at the start or were played.
+    seen: Logs,
     /// The end of the timeline so far.
     end_ns: u64,
     /// The episode that was played last.
@@ -56,7 +57,7 @@ impl Follower {
     /// # Errors
     /// If the address cannot be listened on.
     pub fn start(address: SocketAddr, directory: PathBuf, clock: Clock) -> Result<Self, Error> {
-        let seen = logs_in(&directory).into_iter().collect();
+        let seen = logs_in(&directory).unwrap_or_default();
         let subscribed = Arc::new(Subscribed::default());
         let listener = Arc::clone(&subscribed) as Arc<dyn ServerListener>;
         let server = Server::start(address, "tandem", None, Some(listener))?;
@@ -96,11 +97,15 @@ impl Follower {
 
     /// Returns the next episode to play. Older ones that were not played yet are left out.
     fn next_episode(&mut self) -> Option<Episode> {
-        let new: Vec<PathBuf> =
-            logs_in(&self.directory).into_iter().filter(|log| !self.seen.contains(log)).collect();
+        let logs = logs_in(&self.directory)?;
+        // Logs that were deleted, or written again by a resumed run, are not seen.
+        self.seen.retain(|log, inode| logs.get(log) == Some(inode));
+        let is_new = |log: &&PathBuf| !self.seen.contains_key(*log);
+        let new: Vec<PathBuf> = logs.keys().filter(is_new).cloned().collect();
         let path = next_log(&new)?.to_owned();
         let is_left_out = |log: &&PathBuf| evaluation(log) <= evaluation(&path);
-        self.seen.extend(new.iter().filter(is_left_out).cloned());
+        let left_out = new.iter().filter(is_left_out);
+        self.seen.extend(left_out.filter_map(|log| Some((log.clone(), *logs.get(log)?))));
         let mut episode = Episode::read(&path).ok()?;
         let start_ns = if self.end_ns == 0 { 0 } else { self.end_ns.saturating_add(PAUSE_NS) };
         episode.shift(start_ns);
@@ -129,14 +134,14 @@ impl Follower {
     }
 }
 
-/// Returns the finished logs in `directory` in the order of their names, evaluations before training episodes; none if
-/// it cannot be read.
-fn logs_in(directory: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
+/// Logs with their inodes, in the order of their names: evaluations before training episodes.
+type Logs = BTreeMap<PathBuf, u64>;
+
+/// Returns the finished logs in `directory`, `None` if it cannot be read.
+fn logs_in(directory: &Path) -> Option<Logs> {
+    let entries = std::fs::read_dir(directory).ok()?.flatten();
     let is_log = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "mcap");
-    let mut logs: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_log).collect();
-    logs.sort();
-    logs
+    Some(entries.map(|it| (it.path(), it.ino())).filter(|(path, _)| is_log(path)).collect())
 }
 
 /// Returns the first log of the newest evaluation among `new` or, without one, the newest training episode.

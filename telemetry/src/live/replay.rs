@@ -1,5 +1,6 @@
 //! Playback of a fixed set of logs.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,7 +10,9 @@ use foxglove::websocket::{
     ChannelView, Client, PlaybackControlRequest, PlaybackState, ServerListener,
 };
 
-use super::episode::Episode;
+use tandem_core::text::error_chain;
+
+use super::episode::{ChannelDescription, Episode};
 use super::transport::Transport;
 use super::{Clock, PAUSE_NS, Server, TICK};
 use crate::error::Error;
@@ -20,6 +23,8 @@ pub struct Replay {
     address: SocketAddr,
     control: Arc<Control>,
     logs: Vec<LogSpan>,
+    /// Indices of the logs that can no longer be read.
+    unreadable: BTreeSet<usize>,
     /// The log that was read last, and its index.
     loaded: Option<(usize, Episode)>,
     /// The position up to which messages were published.
@@ -65,20 +70,36 @@ impl ServerListener for Control {
 }
 
 impl Replay {
-    /// Reads all of `logs`, which are played in this order, and listens on `address`; port 0 selects a free port.
+    /// Reads all of `logs`, which are played in this order, and listens on `address`; port 0 selects a free port. Logs
+    /// that cannot be read are left out with a warning.
     ///
     /// # Errors
-    /// If a log cannot be read or the address cannot be listened on.
+    /// If no log can be read or the address cannot be listened on.
     pub fn start(address: SocketAddr, logs: &[PathBuf], clock: Clock) -> Result<Self, Error> {
         let mut spans: Vec<LogSpan> = Vec::with_capacity(logs.len());
-        let mut episodes = Vec::new();
+        let mut channels: Vec<ChannelDescription> = Vec::new();
+        let mut unreadable = Vec::new();
         for path in logs {
-            let episode = Episode::read(path)?;
+            let episode = match Episode::read(path) {
+                Ok(episode) => episode,
+                Err(error) => {
+                    unreadable.push(error);
+                    continue;
+                }
+            };
             let start_ns = spans.last().map_or(0, |span| span.end_ns.saturating_add(PAUSE_NS));
             let end_ns = start_ns.saturating_add(episode.end_ns());
             spans.push(LogSpan { path: path.clone(), start_ns, end_ns });
-            episodes.push(episode.channels);
+            for channel in episode.channels {
+                if channels.iter().all(|known| known.topic != channel.topic) {
+                    channels.push(channel);
+                }
+            }
         }
+        if spans.is_empty() && !unreadable.is_empty() {
+            return Err(unreadable.swap_remove(0));
+        }
+        unreadable.iter().for_each(warn_of);
         let end_ns = spans.last().map_or(0, |span| span.end_ns);
         let control = Arc::new(Control {
             transport: Mutex::new(Transport::playing(end_ns, clock())),
@@ -87,11 +108,10 @@ impl Replay {
         });
         let listener = Arc::clone(&control) as Arc<dyn ServerListener>;
         let mut server = Server::start(address, "tandem", Some((0, end_ns)), Some(listener))?;
-        for channels in &episodes {
-            server.channels.open(channels)?;
-        }
+        server.channels.open(&channels)?;
         let address = server.address(address);
-        Ok(Self { server, address, control, logs: spans, loaded: None, published_ns: None })
+        let (unreadable, loaded, published_ns) = (BTreeSet::new(), None, None);
+        Ok(Self { server, address, control, logs: spans, unreadable, loaded, published_ns })
     }
 
     /// Returns the address that viewers connect to.
@@ -100,10 +120,11 @@ impl Replay {
         self.address
     }
 
-    /// Plays until `is_stopped` returns true, then closes all connections.
+    /// Plays until `is_stopped` returns true, then closes all connections. For a log that can no longer be read, it
+    /// shows nothing.
     ///
     /// # Errors
-    /// If a log can no longer be read.
+    /// If none of the logs can be read any longer.
     pub fn run(mut self, is_stopped: &dyn Fn() -> bool) -> Result<(), Error> {
         let mut n_clients = 0;
         while !is_stopped() {
@@ -185,15 +206,33 @@ impl Replay {
         self.logs.partition_point(|log| log.start_ns <= time_ns).saturating_sub(1)
     }
 
+    /// Reads a log, if it can be read. A log budget may have deleted it since the start.
     fn load(&mut self, log_idx: usize) -> Result<(), Error> {
         if self.loaded.as_ref().is_some_and(|(loaded, _)| *loaded == log_idx) {
             return Ok(());
         }
-        if let Some(log) = self.logs.get(log_idx) {
-            let mut episode = Episode::read(&log.path)?;
-            episode.shift(log.start_ns);
-            self.loaded = Some((log_idx, episode));
+        self.loaded = None;
+        if self.unreadable.contains(&log_idx) {
+            return Ok(());
+        }
+        let Some(log) = self.logs.get(log_idx) else { return Ok(()) };
+        match Episode::read(&log.path) {
+            Ok(mut episode) => {
+                episode.shift(log.start_ns);
+                self.loaded = Some((log_idx, episode));
+            }
+            Err(error) => {
+                self.unreadable.insert(log_idx);
+                if self.unreadable.len() == self.logs.len() {
+                    return Err(error);
+                }
+                warn_of(&error);
+            }
         }
         Ok(())
     }
+}
+
+fn warn_of(error: &Error) {
+    tracing::warn!(error = error_chain(error), "episode left out");
 }

@@ -236,6 +236,34 @@ fn a_viewer_seeks_a_replay_and_gets_the_messages_of_that_time() {
 }
 
 #[test]
+fn a_replay_continues_without_logs_that_are_damaged_or_were_deleted() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut paths = vec![directory.path().join("eval-000000-000.mcap")];
+    std::fs::write(&paths[0], "no log").unwrap();
+    let clock = ManualClock::default();
+    assert!(Replay::start(any_port(), &paths, clock.clock()).is_err(), "nothing to play");
+    paths.extend(logs(directory.path()));
+    let replay = Replay::start(any_port(), &paths, clock.clock()).unwrap();
+    std::fs::remove_file(&paths[1]).unwrap();
+    let address = replay.address();
+    while_playing(
+        |stop| replay.run(stop).unwrap(),
+        || {
+            let mut viewer = Viewer::connect(address);
+            let (info, [transition]) = viewer.channels(["/transition"]);
+            assert_eq!(info["dataEndTime"], json!({ "sec": 4, "nsec": 500_000_000 }), "{info}");
+            viewer.subscribe(1, transition);
+            clock.set(60_000);
+            let time_ns = viewer.wait_for(|message| match message {
+                Received::Data(1, time_ns, _) => Some(time_ns),
+                _ => None,
+            });
+            assert!(time_ns >= 2_500_000_000, "a message of the last log: {time_ns}");
+        },
+    );
+}
+
+#[test]
 fn a_follower_plays_only_logs_that_are_new() {
     let directory = tempfile::tempdir().unwrap();
     logs(directory.path());
@@ -276,6 +304,14 @@ fn a_follower_plays_only_logs_that_are_new() {
                 _ => None,
             });
             assert_eq!(last_ns, 2_000_000_000, "the last state of the episode");
+
+            // A resumed run evaluates a policy again.
+            synthetic::write_log(&mcap.join("eval-000002-000.mcap")).unwrap();
+            clock.set(millis + 120_000);
+            late.wait_for(|message| match message {
+                Received::Data(2, time_ns, _) => (time_ns > last_ns).then_some(()),
+                _ => None,
+            });
         },
     );
 }
