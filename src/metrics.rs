@@ -34,12 +34,11 @@ fn add_process(registry: &mut Registry, start_s: f64) {
     registry.register("process_start_time_seconds", help, ConstGauge::new(start_s));
 }
 
-/// Checks that the address of the page is free, if there is one.
-pub(crate) fn check_address(args: &MetricsArgs) -> Result<(), Failed> {
-    args.metrics_listen.map_or(Ok(()), |address| {
-        let bound = std::net::TcpListener::bind(address);
-        bound.map(drop).or_exit(Exit::TryAgain, || cannot_listen(address))
-    })
+/// Checks that the address of the page is free, if there is one, and returns it with a free port in place of port 0.
+pub(crate) fn free_address(args: &MetricsArgs) -> Result<Option<SocketAddr>, Failed> {
+    let bind = |address| std::net::TcpListener::bind(address)?.local_addr();
+    let free = |address| bind(address).or_exit(Exit::TryAgain, || cannot_listen(address));
+    args.metrics_listen.map(free).transpose()
 }
 
 fn cannot_listen(address: SocketAddr) -> String {

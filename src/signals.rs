@@ -4,6 +4,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::runtime;
 
 /// Returns a token that is cancelled by SIGINT or SIGTERM and, if `exit_with_stdin`, when standard input closes.
 pub(crate) fn shutdown_token(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
@@ -22,6 +23,26 @@ pub(crate) fn shutdown_token(exit_with_stdin: bool) -> Result<CancellationToken,
         cancel.cancel();
     });
     Ok(token)
+}
+
+/// Runs `work` on a thread of its own. If a signal or, with `exit_with_stdin`, the end of standard input comes first, the
+/// work is abandoned: the process is about to end.
+pub(crate) fn unless_interrupted<T: Send + 'static>(
+    exit_with_stdin: bool,
+    work: impl FnOnce() -> Result<T, Failed> + Send + 'static,
+) -> Result<T, Failed> {
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let interrupted = shutdown_token(exit_with_stdin)?;
+        let (done, is_done) = tokio::sync::oneshot::channel();
+        std::thread::spawn(move || drop(done.send(work())));
+        tokio::select! {
+            result = is_done => result.or_exit(Exit::Bug, || "the thread panicked".to_owned())?,
+            () = interrupted.cancelled() => {
+                Err(Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted")))
+            }
+        }
+    })
 }
 
 /// Handles SIGXFSZ, so that a write beyond the file size limit (`ulimit -f`) is an error like that of a full disk and

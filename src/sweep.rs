@@ -240,7 +240,10 @@ impl<'a> Sweep<'a> {
         if interrupted.is_cancelled() {
             return self.save(running).await;
         }
-        self.end("complete");
+        match self.statuses.iter().filter(|status| status.failure.is_some()).count() {
+            0 => self.end("complete"),
+            n_failed => self.end(&format!("{n_failed} of {} runs failed", self.statuses.len())),
+        }
         Ok(true)
     }
 
@@ -279,8 +282,13 @@ impl<'a> Sweep<'a> {
     ) -> Result<(), Failed> {
         let (status, n_workers) = (&self.statuses[idx], self.workers_per_run());
         let has_dashboard = self.runs_have_dashboards;
-        let run = RunProcess::prepare(status, self.environment, n_workers, has_dashboard)
-            .or_cannot_write(String::new)?;
+        let run = match RunProcess::prepare(status, self.environment, n_workers, has_dashboard) {
+            Ok(run) => run,
+            Err(error) => {
+                return self.handle_outcome(idx, RunOutcome::Failed(format!("{error:#}")));
+            }
+        };
+        self.statuses[idx].begin();
         self.display.started(&run.name, run.log_path());
         let (sender, progress) = watch::channel(Value::Null);
         if let Some(board) = &mut self.board {

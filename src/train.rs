@@ -53,14 +53,14 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
-    let plan = Plan::of(args, environment, served.as_ref())?;
     // An address in use is reported before anything is written.
-    metrics::check_address(&args.metrics)?;
+    let metrics = metrics::free_address(&args.metrics)?;
+    let plan = Plan { metrics, ..Plan::of(args, environment, served.as_ref())? };
     let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
     plan.prepare()?;
-    let inputs = RunInputs::write(&plan)?;
+    let inputs = RunInputs::write(&plan, &lock)?;
     drop(service_locks);
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let (last, memory) = runtime.block_on(async {
@@ -235,6 +235,7 @@ impl<'a> Supervisor<'a> {
         self.stream = stream;
         if self.last.task.is_empty() {
             // The learner has loaded its checkpoint, so the run continues.
+            self.processes.run_file_is_written();
             let removed = summary::remove(&self.plan.out);
             for kept in [removed, self.plan.keep_teacher(), self.plan.keep_environment()] {
                 if let Err(failed) = kept {

@@ -311,7 +311,7 @@ impl LearnerLoop<'_> {
         let reached = match stop {
             StopReason::Interrupted => None,
             StopReason::Reached(reason) => {
-                if round > 0 && !self.evaluations.covers(round) {
+                if !self.evaluations.covers(round) {
                     self.schedule_evaluation(&self.trainer.stats());
                     self.order_evaluation();
                 }

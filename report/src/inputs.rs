@@ -86,6 +86,9 @@ impl ReportInputs {
             }
         }
         for file in &found.trials_files {
+            if !self.is_new(file) {
+                continue;
+            }
             match read_trials(file, &mut self.warnings) {
                 Ok(rows) => self.trials.extend(rows),
                 Err(error) => {

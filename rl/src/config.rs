@@ -28,7 +28,8 @@ pub use recipe::Recipe;
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`.
+    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`. A new run of `tandem
+    /// train` is named after its directory.
     pub name: String,
     /// A built-in task, by its full name: `push` and `pick-and-place` are those of the classic world. Or the name of
     /// `description`.
@@ -225,7 +226,8 @@ pub struct EvaluationConfig {
     /// recipe's.
     pub every_env_steps: u64,
     /// Further evaluations before the first regular one, 0 to 100: of the initial policy, then evenly spaced. A run
-    /// file that sets `evaluation.every_env_steps` has none unless it sets them.
+    /// file that sets `evaluation.every_env_steps` has none unless it sets them, and a run that is so short that it is
+    /// evaluated more often than the recipe says has one.
     #[serde(default)]
     pub early_points: u64,
     /// Fixed goals per evaluation, 1 to 100,000 (paper: 240).

@@ -11,6 +11,7 @@ use tandem_core::task::Part;
 use tandem_core::text::{counted, hex};
 use tandem_core::work::PublishedActor;
 use tandem_core::{ArmIndex, Episode, TaskSpec};
+use tandem_policy::normalizer::STD_FLOOR;
 use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
@@ -438,12 +439,13 @@ fn first_implausible(
     snapshot: &NormalizerSnapshot,
     largest: impl Fn(usize) -> f32,
 ) -> Option<String> {
-    // A mean or a standard deviation of bounded numbers exceeds their bound only by rounding.
-    let is_sane = |value: f32, idx| value.abs() <= 1.001 * largest(idx);
-    let numbers = snapshot.mean.iter().zip(&snapshot.std).enumerate();
-    let (idx, (mean, std)) = numbers
-        .into_iter()
-        .find(|(idx, (mean, std))| !(is_sane(**mean, *idx) && is_sane(**std, *idx)))?;
+    // A mean or a standard deviation of bounded numbers exceeds their bound only by rounding. The latter has a floor.
+    let is_sane = |(idx, (mean, std)): &(usize, (&f32, &f32))| {
+        let largest = 1.001 * largest(*idx);
+        mean.abs() <= largest && std.abs() <= largest.max(STD_FLOOR)
+    };
+    let mut numbers = snapshot.mean.iter().zip(&snapshot.std).enumerate();
+    let (idx, (mean, std)) = numbers.find(|number| !is_sane(number))?;
     Some(format!(
         "number {idx} of the {what} has mean {mean:e} and standard deviation {std:e} over the run, which no world produces: \
          the policy cannot learn from it"

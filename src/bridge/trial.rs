@@ -58,7 +58,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
             mode.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
         return Err(Failed::usage(format!("--mode {name} is given twice")));
     }
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("runs/trial-{task}")));
+    let out = args.out.clone().unwrap_or_else(|| free_directory(task));
     create_directory(&out)?;
     if args.motions {
         create_directory(&out.join(MOTIONS))?;
@@ -89,6 +89,18 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
         }
     }
     show(args, all, &file)
+}
+
+/// Returns `runs/trial-TASK`, and the same with a number appended if that has trials.
+fn free_directory(task: Task) -> PathBuf {
+    let base = format!("runs/trial-{task}");
+    let numbered = (2..).map(|n: u32| PathBuf::from(format!("{base}.{n}")));
+    let has_trials =
+        |out: &PathBuf| std::fs::metadata(out.join(TRIALS_FILE)).is_ok_and(|file| file.len() > 0);
+    std::iter::once(PathBuf::from(&base))
+        .chain(numbered)
+        .find(|out| !has_trials(out))
+        .unwrap_or(base.into())
 }
 
 /// Returns half the edge of the blocks that `policy` was trained with, metres. Where sizes varied it knows those of `block`.

@@ -13,6 +13,11 @@ use crate::exit::{Exit, Failed};
 use crate::{access, metrics, signals};
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
+    if matches!(args.recording.record, RecordedName::All) && args.log_dir.is_none() {
+        return Err(Failed::usage(
+            "--record all needs --log-dir, the directory of the recorded episodes",
+        ));
+    }
     let own = metrics::of_process("worker");
     let client_config =
         access::client_config(&args.client_config, &args.secret)?.with_metrics(own.clone());

@@ -186,6 +186,10 @@ fn write_run_file(status: &RunStatus) -> anyhow::Result<PathBuf> {
         // A run of `State::New` has learned nothing, so its run file can be replaced.
         std::fs::remove_file(&leftover)
             .with_context(|| format!("cannot remove {}", leftover.display()))?;
+        // The verdicts of its teacher are those of other settings.
+        for name in ["ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm"] {
+            drop(std::fs::remove_file(status.dir.join(name)));
+        }
     }
     let text = run_file::to_toml(&status.run.config)?;
     std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;

@@ -61,6 +61,12 @@ impl RunStatus {
         }
     }
 
+    /// Forgets why the former attempt failed: another one has begun.
+    pub(super) fn begin(&mut self) {
+        drop(std::fs::remove_file(failure_path(&self.dir)));
+        self.failure = None;
+    }
+
     /// Marks a run as finished, with the summary that it has written.
     pub(super) fn finish(&mut self, summary: Json) {
         drop(std::fs::remove_file(failure_path(&self.dir)));
@@ -98,7 +104,12 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
         Ok(existing) => differences(existing, &run.config)?,
         Err(error) => vec![(String::new(), format!("{error:#}"))],
     };
-    let summary = summary(dir)?;
+    let length = existing.as_ref().map_or(0, |existing| existing.stop.max_env_steps);
+    // An extension that was interrupted at once has left the summary of the shorter run.
+    let is_of_length = |summary: &Json| {
+        summary.get("max_env_steps").and_then(Json::as_u64).is_none_or(|of_run| of_run == length)
+    };
+    let summary = summary(dir)?.filter(is_of_length);
     let has_same_teacher = same_teacher(run, dir);
     if differences.is_empty() && has_same_teacher {
         return Ok((summary.map_or(State::Started, State::Finished), None));
@@ -106,7 +117,6 @@ fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
     if summary.is_none() && !has_learned(dir) {
         return Ok((State::New, None));
     }
-    let length = existing.map_or(0, |existing| existing.stop.max_env_steps);
     let planned_length = run.config.stop.max_env_steps;
     let is_longer = length > 0 && planned_length > length;
     if is_longer && has_same_teacher && differences.iter().all(|(key, _)| key == LENGTH) {
@@ -223,11 +233,17 @@ mod tests {
         assert_eq!(begun.state, State::Started);
         begun.fail("the disk is full".to_owned()).expect("writes");
         assert_eq!(status(out, 0.95).expect("fits").failure.as_deref(), Some("the disk is full"));
+        begun.begin();
+        assert_eq!((&begun.failure, status(out, 0.95).expect("fits").failure), (&None, None));
+        begun.fail("the disk is full".to_owned()).expect("writes");
         begun.finish(json!({"digest": "d"}));
         has_ended(out);
         let finished = status(out, 0.95).expect("fits");
         assert_eq!(finished.state, State::Finished(json!({"digest": "d"})));
         assert_eq!(finished.failure, None);
+        let of_shorter_run = "{\"digest\": \"d\", \"max_env_steps\": 800}";
+        std::fs::write(summary_path(&finished.dir), of_shorter_run).expect("writes");
+        assert_eq!(status(out, 0.95).expect("fits").state, State::Started);
     }
 
     #[test]

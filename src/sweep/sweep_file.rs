@@ -112,6 +112,10 @@ fn environment(file: &SweepFile) -> anyhow::Result<EnvironmentArgs> {
     {
         ensure!(path.is_none() || file.env.is_some(), "{key} is set without env");
     }
+    ensure!(
+        file.env_timeout_s.is_none() || file.env.is_some() || file.env_command.is_some(),
+        "env_timeout_s is set without env and env_command"
+    );
     let timeout = file.env_timeout_s.map(Duration::try_from_secs_f64).transpose().ok();
     let timeout = timeout.filter(|timeout| timeout.is_none_or(|timeout| !timeout.is_zero()));
     let expected = "env_timeout_s: expected a number of seconds, more than 0";
@@ -148,6 +152,7 @@ fn runs(file: &SweepFile, of_server: &[(String, Value)]) -> anyhow::Result<Vec<P
         }
     }
     reject_equal_names(&runs)?;
+    reject_other_teachers(&file.teachers, &runs)?;
     Ok(runs)
 }
 
@@ -208,6 +213,19 @@ fn reject_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
         Some(run) => bail!("two runs would be called {}: something is listed twice", run.name),
         None => Ok(()),
     }
+}
+
+/// Rejects a teacher of a task that no run has. The tasks of runs have their full names.
+fn reject_other_teachers(
+    teachers: &BTreeMap<String, PathBuf>,
+    runs: &[PlannedRun],
+) -> anyhow::Result<()> {
+    let tasks: BTreeSet<&str> = runs.iter().map(|run| run.config.task.as_str()).collect();
+    let other = teachers.keys().find(|task| !tasks.contains(task.as_str()));
+    other.map_or(Ok(()), |task| {
+        let tasks = Vec::from_iter(tasks).join(", ");
+        bail!("[teachers] {task}: expected the name of a task of the runs: {tasks}")
+    })
 }
 
 /// Returns the entries of an optional list.

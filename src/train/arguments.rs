@@ -11,6 +11,9 @@ use crate::environment_server;
 /// The option of the learner that names the address of the dashboard.
 pub(super) const DASHBOARD: &str = "--dashboard-listen";
 
+/// The option with which the learner writes the run file of a run that it continues.
+pub(super) const KEEP_RUN_FILE: &str = "--keep-run-file";
+
 /// Returns the arguments of the teacher.
 pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
     let mut args = command("teacher");

@@ -34,6 +34,9 @@ pub(super) fn environment_of(args: &TrainArgs) -> Result<EnvironmentArgs, Failed
     let given = args.environment.clone();
     let path = args.out.as_deref().filter(|_| args.resume).map(path_in);
     let Some(path) = path.filter(|path| !names_server(&given) && path.exists()) else {
+        if given.env_timeout_s.is_some() && !names_server(&given) {
+            return Err(Failed::usage("--env-timeout-s needs --env or --env-command"));
+        }
         return Ok(given);
     };
     let what = || "name the server with --env or --env-command".to_owned();

@@ -7,20 +7,23 @@ use std::path::{Path, PathBuf};
 use tandem_system::atomic_file;
 
 use super::plan::Plan;
+use super::run_lock::RunLock;
 use super::teacher_file::TeacherFile;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_file;
 
-/// The copies of one start, in the subdirectory `in-use`. Dropping this value removes them.
+/// The copies of one start, in the subdirectory `in-use`. Dropping this value removes them, unless another directory has
+/// taken the place of the run's.
 #[derive(Debug)]
-pub(super) struct RunInputs {
+pub(super) struct RunInputs<'a> {
     directory: PathBuf,
+    lock: &'a RunLock,
 }
 
-impl RunInputs {
-    /// Writes the copies. The caller holds the lock on the run directory.
-    pub(super) fn write(plan: &Plan) -> Result<Self, Failed> {
-        let inputs = Self { directory: directory(&plan.out) };
+impl<'a> RunInputs<'a> {
+    /// Writes the copies to the run directory, which `lock` locks.
+    pub(super) fn write(plan: &Plan, lock: &'a RunLock) -> Result<Self, Failed> {
+        let inputs = Self { directory: directory(&plan.out), lock };
         let failed = || format!("cannot write to {}", plan.out.display());
         std::fs::create_dir_all(&inputs.directory).or_exit(Exit::TryAgain, failed)?;
         let text = run_file::to_text(&plan.config)?;
@@ -34,9 +37,11 @@ impl RunInputs {
     }
 }
 
-impl Drop for RunInputs {
+impl Drop for RunInputs<'_> {
     fn drop(&mut self) {
-        drop(std::fs::remove_dir_all(&self.directory));
+        if self.lock.is_in_place() {
+            drop(std::fs::remove_dir_all(&self.directory));
+        }
     }
 }
 

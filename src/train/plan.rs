@@ -65,6 +65,7 @@ impl Plan {
             true => Some(teacher_file(args, &config, &out)?),
             false => None,
         };
+        check_advice_options(args, &config)?;
         let n_workers = args.workers.unwrap_or_else(|| default_workers(&config));
         if !(1..=1024).contains(&n_workers) {
             return Err(Failed::usage(format!("--workers {n_workers}: expected 1 to 1024")));
@@ -304,14 +305,15 @@ fn account_name(out: &Path) -> Option<String> {
 
 /// Reports that the run has another directory than usual, because there is a run in that one.
 fn remark_on(base: &Path, out: &Path) {
-    let (state, word, base) = (run_directory::state(base), shell_word(base), base.display());
-    output::message(wrapped(
-        &format!(
-            "{base} exists ({state}; `tandem train --resume --out {word}` resumes it): this run is {}",
-            out.display()
-        ),
-        "  ",
-    ));
+    let what = match base.join("run.toml").exists() {
+        true => {
+            let (state, word) = (run_directory::state(base), shell_word(base));
+            format!("{state}; `tandem train --resume --out {word}` resumes it")
+        }
+        false => "it holds no run".to_owned(),
+    };
+    let text = format!("{} exists ({what}): this run is {}", base.display(), out.display());
+    output::message(wrapped(&text, "  "));
 }
 
 /// Returns `runs/TASK-ARMS-STRATEGY-seedN`, and the same with a number appended if that exists.
@@ -324,6 +326,21 @@ fn free_run_directory(config: &RunConfig) -> (PathBuf, PathBuf) {
     let free = std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists());
     let free = free.unwrap_or_else(|| base.clone());
     (base, free)
+}
+
+/// Rejects options about advice for a run without any.
+fn check_advice_options(args: &TrainArgs, config: &RunConfig) -> Result<(), Failed> {
+    let options = [
+        ("--teacher", args.teacher.is_some() && !config.advice.needs_teacher()),
+        ("--teacher-critic", args.teacher_critic.is_some() && !config.advice.asks()),
+        ("--budget", args.budget.is_some() && !config.advice.asks()),
+    ];
+    options.into_iter().find(|(_, is_useless)| *is_useless).map_or(Ok(()), |(option, _)| {
+        let strategy = &config.advice.strategy;
+        Err(Failed::usage(format!(
+            "{option}: a run with strategy {strategy} does not use it: leave it out, or choose another --strategy"
+        )))
+    })
 }
 
 /// Returns the name of the task that the run's teacher performs.

@@ -32,6 +32,8 @@ pub(crate) struct RunProcesses {
     dashboard_ip: Option<IpAddr>,
     /// Address of the dashboard, if there is one.
     dashboard: Option<SocketAddr>,
+    /// The learner has still to write the run file, which it does when it has loaded its checkpoint.
+    awaits_run_file: bool,
     peak: PeakMemory,
 }
 
@@ -95,6 +97,7 @@ impl RunProcesses {
             learner_address: String::new(),
             dashboard_ip: plan.dashboard.map(|address| address.ip()),
             dashboard: None,
+            awaits_run_file: true,
             peak: PeakMemory::default(),
         })
     }
@@ -106,7 +109,7 @@ impl RunProcesses {
             self.teacher_address = Some(self.start_service(Role::Teacher, &args, display).await?);
         }
         let mut args = arguments::learner(plan, self.teacher_address.as_deref(), plan.resume);
-        args.push("--keep-run-file".into());
+        args.push(arguments::KEEP_RUN_FILE.into());
         arguments::push_dashboard(&mut args, plan, plan.dashboard);
         self.learner_address = self.start_service(Role::Learner, &args, display).await?;
         for number in 1..=plan.n_workers {
@@ -115,6 +118,11 @@ impl RunProcesses {
             self.processes.push(Process::new(Role::Worker, name, child));
         }
         Ok(())
+    }
+
+    /// Notes that the learner has written the run file, which a restarted one leaves as it is.
+    pub(crate) const fn run_file_is_written(&mut self) {
+        self.awaits_run_file = false;
     }
 
     pub(crate) fn learner_address(&self) -> &str {
@@ -267,6 +275,9 @@ impl RunProcesses {
         };
         arguments::push_address(&mut args, "--listen", address);
         if *role == Role::Learner {
+            if self.awaits_run_file {
+                args.push(arguments::KEEP_RUN_FILE.into());
+            }
             arguments::push_dashboard(&mut args, plan, self.dashboard);
         }
         let child = self.spawn(name, &args, Stdio::null())?;

@@ -18,7 +18,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{advice_text, clock_text, grouped};
 use crate::run_pages::RunPages;
 use crate::shell::shell_word;
-use crate::{film, output, policy_file, run_directory};
+use crate::{film, output, policy_file, run_directory, signals};
 
 /// File in the run directory.
 const FILE: &str = "summary.json";
@@ -41,7 +41,8 @@ pub(super) fn print(
     })?;
     let json = summary_json(plan, last, memory, &result).to_string();
     save(&plan.out, &json).map_err(|failed| failed.context(saved()))?;
-    let pages = RunPages::write(&plan.config, &plan.out, &films(&result)?)?;
+    let pages = films(&result).and_then(|films| RunPages::write(&plan.config, &plan.out, &films));
+    let pages = pages.map_err(|failed| failed.context(saved()))?;
     let summary = match args.json {
         true => json,
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
@@ -75,7 +76,10 @@ fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
         let subject = (Part::AllArms, &policy);
         return measure_served(&plan.environment, subject, goals, args.exit_with_stdin);
     }
-    measure(&EvaluatedPolicy::new(policy, &path)?, n_episodes, TEST_SEED)
+    let subject = EvaluatedPolicy::new(policy, &path)?;
+    signals::unless_interrupted(args.exit_with_stdin, move || {
+        measure(&subject, n_episodes, TEST_SEED)
+    })
 }
 
 /// Draws the first success and the first failure of the test, if the simulator has the task. A test of few goals says
@@ -217,6 +221,7 @@ fn summary_json(
         "run_dir": plan.out.to_string_lossy(),
         "policy": plan.best_policy().to_string_lossy(),
         "digest": last.digest,
+        "max_env_steps": plan.config.stop.max_env_steps,
     });
     if !last.environment.is_empty() {
         summary["environment"] = last.environment.as_str().into();

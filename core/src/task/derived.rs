@@ -1,6 +1,8 @@
 //! Tasks that follow from a task: that of one of its arms, and that of several copies of its arms.
 
-use super::{ArmDescription, InvalidTask, Manipulation, Part, TaskDescription, TaskSpec};
+use super::{
+    ArmDescription, InvalidTask, Manipulation, Part, Reflection, TaskDescription, TaskSpec,
+};
 use crate::layout::{ArmIndex, Layout};
 
 impl TaskSpec {
@@ -54,6 +56,7 @@ impl TaskSpec {
                 other => other.to_owned(),
             },
             manipulation: of_one_arm(description)?,
+            reflection: Reflection { whole_scene: false, ..description.reflection.clone() },
             ..description.clone()
         })
         .ok()

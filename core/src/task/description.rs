@@ -177,8 +177,7 @@ impl TaskDescription {
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<TaskDifference> {
         let differs = |field: &str, first: &dyn fmt::Debug, second: &dyn fmt::Debug| {
-            let shown = |value| shortened(&format!("{value:?}"), MAX_SHOWN_CHARS);
-            let (first, second) = (shown(first), shown(second));
+            let (first, second) = from_difference(&format!("{first:?}"), &format!("{second:?}"));
             Some(TaskDifference { field: field.to_owned(), first, second })
         };
         macro_rules! compare {
@@ -202,9 +201,33 @@ impl TaskDescription {
         }
         compare!(achieved_goal, episode_steps, tolerance, norm, interchangeable_arms);
         compare!(reports_contacts, origin_distance, recombination_gap, base, contact_distances);
-        compare!(observation_bound, goal_bound, manipulation, reflection);
-        None
+        compare!(observation_bound, goal_bound, manipulation);
+        // One arm has no other to mirror.
+        let mut reflection = self.reflection.clone();
+        if self.arms.len() == 1 {
+            reflection.whole_scene = other.reflection.whole_scene;
+        }
+        match reflection == other.reflection {
+            true => None,
+            false => differs("reflection", &reflection, &other.reflection),
+        }
     }
+}
+
+/// Shortens the texts of two values that differ. Where the start that is shown would be the same, what precedes the
+/// difference is left out.
+fn from_difference(first: &str, second: &str) -> (String, String) {
+    let is_same = |(first, second): &(char, char)| first == second;
+    let n_same = first.chars().zip(second.chars()).take_while(is_same).count();
+    let n_omitted = match n_same < MAX_SHOWN_CHARS {
+        true => 0,
+        false => n_same - MAX_SHOWN_CHARS / 2,
+    };
+    let shown = |text: &str| {
+        let rest: String = text.chars().skip(n_omitted).collect();
+        format!("{}{}", if n_omitted > 0 { "..." } else { "" }, shortened(&rest, MAX_SHOWN_CHARS))
+    };
+    (shown(first), shown(second))
 }
 
 impl ArmDescription {
@@ -257,5 +280,17 @@ mod tests {
         check(|task| task.goal_bound[5] = 1.0, {
             "goal_bound is [2.0, 2.0, 2.0, 2.0, 2.0, 2.0] and [2.0, 2.0, 2.0, 2.0, 2.0, 1.0]"
         });
+        check(|task| task.reflection.plane = 1.0, {
+            "reflection is ...action: [], moved: [], plane: 0.0, whole_scene: false } and \
+             ...action: [], moved: [], plane: 1.0, whole_scene: false }"
+        });
+        check(|task| task.reflection.whole_scene = true, {
+            "reflection is ... [], plane: 0.0, whole_scene: false } and \
+             ... [], plane: 0.0, whole_scene: true }"
+        });
+        let one_arm = Layout::new(Task::Push, 1).description();
+        let mut of_whole_scene = one_arm.clone();
+        of_whole_scene.reflection.whole_scene = true;
+        assert_eq!(one_arm.difference(&of_whole_scene), None, "one arm is a scene of its own");
     }
 }
