@@ -65,6 +65,9 @@ def sweep(arguments: list[str]) -> list[str]:
     for key in ("tasks", "seeds", "variant"):
         if key in sweep:
             sweep[key] = sweep[key][:1]
+    if "teachers" in sweep and "tasks" in sweep:
+        # A teacher of a task that is left out is refused.
+        sweep["teachers"] = {task: path for task, path in sweep["teachers"].items() if task in sweep["tasks"]}
     if "strategies" in sweep:
         sweep["strategies"] = sweep["strategies"][-1:]
     for axis in sweep.get("axis", []):
