@@ -241,13 +241,12 @@ impl AdviceAccount {
         if episodes.is_empty() {
             return Ok(Vec::new());
         }
-        let opened = match self.call_open_leases(&episodes) {
-            Err(TeacherError::UnknownAccount(_)) => {
-                self.open_or_reopen(spent)?;
-                self.renew_leases()?;
-                self.call_open_leases(&episodes)?
+        let mut n_losses = 0;
+        let opened = loop {
+            match self.call_open_leases(&episodes) {
+                Err(TeacherError::UnknownAccount(_)) => self.reopen(spent, &mut n_losses)?,
+                opened => break opened?,
             }
-            opened => opened?,
         };
         self.open_episodes.extend(episodes);
         if let Some(account) = &opened.account {
@@ -283,8 +282,7 @@ impl AdviceAccount {
         let claimed = episodes.iter().map(|episode| u64::from(episode.advice_charged)).sum();
         match settled {
             Err(TeacherError::UnknownAccount(_)) => {
-                self.open_or_reopen(spent + claimed)?;
-                self.renew_leases()?;
+                self.reopen(spent + claimed, &mut 0)?;
                 Ok(Settlement { units: claimed, mismatch: None })
             }
             settled => {
@@ -303,10 +301,37 @@ impl AdviceAccount {
     /// Opens the account again if the teacher has lost it. `spent` counts the units of the episodes learned so far.
     pub(crate) fn restore_if_lost(&mut self, spent: u64) -> Result<(), TeacherError> {
         if self.lost.swap(false, Ordering::Relaxed) {
-            self.open_or_reopen(spent)?;
-            self.renew_leases()?;
+            self.reopen(spent, &mut 0)?;
         }
         Ok(())
+    }
+
+    /// Opens an account that the teacher has lost, and the leases of open episodes, as often as the teacher loses it
+    /// again meanwhile. Pauses first unless `n_losses`, which counts the losses in a row, is 0.
+    fn reopen(&mut self, spent: u64, n_losses: &mut u32) -> Result<(), TeacherError> {
+        loop {
+            if *n_losses > 0 {
+                self.pause(BACKOFF.pause_after(*n_losses))?;
+            }
+            *n_losses = n_losses.saturating_add(1);
+            self.open_or_reopen(spent)?;
+            match self.renew_leases() {
+                Err(TeacherError::UnknownAccount(_)) => (),
+                renewed => return renewed,
+            }
+        }
+    }
+
+    /// Waits for `duration`.
+    fn pause(&self, duration: Duration) -> Result<(), TeacherError> {
+        let shutdown = self.shutdown.clone();
+        let pause = async move {
+            tokio::select! {
+                () = tokio::time::sleep(duration) => Ok(()),
+                () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
+            }
+        };
+        self.runtime.wait_on(pause).unwrap_or(Err(TeacherError::Stopped))
     }
 
     /// Continues with the account. If it has more units left than the run may spend, because the ledger was restored to

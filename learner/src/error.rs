@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use tandem_core::EpisodeKind;
 use tandem_net::MAX_MESSAGE_BYTES;
 use tandem_rl::config::{ConfigError, INIT_TEACHER};
 use tandem_rl::ddpg::DdpgError;
@@ -48,6 +49,19 @@ pub enum Error {
         /// Size of the message.
         n_bytes: usize,
     },
+    /// Workers cannot send the episodes of a slot.
+    #[error(
+        "the episodes of a slot are up to {} MiB large and a message at most {}: lower {}",
+        n_bytes.div_ceil(1 << 20),
+        MAX_MESSAGE_BYTES >> 20,
+        size_settings(*kind)
+    )]
+    SlotTooLarge {
+        /// Largest size of the message.
+        n_bytes: usize,
+        /// The kind of the episodes.
+        kind: EpisodeKind,
+    },
     /// Learning diverged.
     #[error(transparent)]
     Diverged(#[from] DdpgError),
@@ -63,4 +77,14 @@ pub enum Error {
     /// The learning thread panicked, which is a bug.
     #[error("the learning thread panicked")]
     Panicked,
+}
+
+/// Names the settings that determine the size of a slot. Evaluation slots have a fixed number of episodes.
+const fn size_settings(kind: EpisodeKind) -> &'static str {
+    match kind {
+        EpisodeKind::Training => {
+            "rounds.rollouts, or episode_steps or n_observation of the task's description"
+        }
+        EpisodeKind::Evaluation => "episode_steps or n_observation of the task's description",
+    }
 }

@@ -106,7 +106,8 @@ pub(crate) struct State {
 }
 
 impl State {
-    /// Records the end of the run and the workers that have to receive it.
+    /// Records the end of the run and the workers that have to receive it: those that may be playing, also if their
+    /// connections have ended. The others call within the time for which the service stays anyway.
     pub(crate) fn finish(&mut self, end: RunEnd) {
         let is_playing = |worker: &Worker| worker.slot.is_some() && !worker.silent;
         let playing = self.queue.workers().filter(|(_, worker)| is_playing(worker));

@@ -78,7 +78,7 @@ pub struct Worker {
     pub last_seen: Duration,
     /// Training and evaluation episodes that it has delivered.
     pub n_episodes: u64,
-    /// The slot assigned to it last, until it delivers the episodes.
+    /// The slot assigned to it last, until it delivers the episodes. A disconnected worker may still be playing it.
     pub slot: Option<u64>,
     /// True if it counts as dead.
     pub silent: bool,
@@ -414,7 +414,7 @@ impl WorkQueue {
     /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker
     /// stays: it may call again, and the episodes that it delivers count.
     pub fn release_slot(&mut self, worker_id: u64) -> bool {
-        self.workers.get_mut(&worker_id).is_some_and(|worker| worker.slot.take().is_some())
+        self.worker(worker_id).is_some_and(|worker| worker.slot.is_some())
             && self.requeue_slots_of(worker_id) > 0
     }
 

@@ -24,7 +24,10 @@ use crate::{
 };
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
-    let run_config = run_file::resolve(Some(&args.run), &[])?;
+    let mut run_config = run_file::resolve(Some(&args.run), &[])?;
+    if args.resume || args.start_or_resume {
+        run_file::keep_interval(&mut run_config, &args.out.join("run.toml"));
+    }
     let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
     let own = metrics::of_process("learner");
     let server_config =
@@ -155,6 +158,7 @@ pub(super) fn learner_failed(error: Error) -> Failed {
         | Error::Teacher(_)
         | Error::StartFrom(_)
         | Error::NetworksTooLarge { .. }
+        | Error::SlotTooLarge { .. }
         | Error::Checkpoint(
             CheckpointError::OtherSettings { .. }
             | CheckpointError::RunExists(_)

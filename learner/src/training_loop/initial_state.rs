@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use tandem_core::work::{PublishedActor, RunTerms};
+use tandem_core::TaskSpec;
+use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
 use tandem_net::{EncodedResponse, MAX_MESSAGE_BYTES};
 use tandem_proto::{encode_actor, pb};
 use tandem_rl::trainer::Trainer;
@@ -20,6 +21,12 @@ use crate::error::Error;
 use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
 use crate::progress::Phase;
 use crate::shared::LearnerConfig;
+
+/// Upper bound of the tags, lengths and integers of an encoded episode: 11 fields and the tag of the episode itself.
+const EPISODE_OVERHEAD_BYTES: usize = 12 * 11;
+/// Upper bound of the fields of a submission other than the episodes; the largest is the text of a difference between
+/// two plays.
+const SUBMISSION_OVERHEAD_BYTES: usize = 4096;
 
 /// The state with which a run starts.
 pub(super) struct InitialState {
@@ -59,6 +66,7 @@ impl InitialState {
         if n_bytes > MAX_MESSAGE_BYTES {
             return Err(Error::NetworksTooLarge { n_bytes });
         }
+        check_slots(&trainer)?;
         Ok(Self { trainer, resumption, is_resumed, lock })
     }
 
@@ -107,6 +115,30 @@ impl InitialState {
         let warnings = &context.shared.warnings;
         Ok(Some(AdviceAccount::open(options, warnings, context.runtime, context.shutdown)?))
     }
+}
+
+/// Checks that a worker can send the episodes of every slot in one message.
+fn check_slots(trainer: &Trainer) -> Result<(), Error> {
+    let max_episode_bytes = max_episode_bytes(&trainer.layout);
+    let check = |order: &SlotOrder| {
+        let n_bytes = SUBMISSION_OVERHEAD_BYTES + order.episodes.len() * max_episode_bytes;
+        if n_bytes > MAX_MESSAGE_BYTES {
+            return Err(Error::SlotTooLarge { n_bytes, kind: order.kind });
+        }
+        Ok(())
+    };
+    // The first slot of each kind is the largest.
+    trainer.evaluation_orders(0).first().map_or(Ok(()), check)?;
+    trainer.training_orders(0, 0).first().map_or(Ok(()), check)
+}
+
+/// Returns an upper bound of the size of an encoded episode within the message that submits it.
+fn max_episode_bytes(task: &TaskSpec) -> usize {
+    let n_steps = task.episode_steps();
+    let n_numbers =
+        (n_steps + 1) * task.n_observation() + task.n_goal() + n_steps * task.n_action();
+    // One byte per step for each of the advised arms and the contacts.
+    size_of::<f32>() * n_numbers + 2 * n_steps + EPISODE_OVERHEAD_BYTES
 }
 
 /// Returns the state before the first round.
@@ -202,4 +234,28 @@ pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
         path,
         source: error.into(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Episode, EpisodeKind, Layout, Task};
+    use tandem_proto::encode_episode;
+
+    use super::*;
+
+    #[test]
+    fn the_size_of_an_episode_is_bounded_closely() {
+        let task = TaskSpec::from(Layout::new(Task::PickAndPlace, 2));
+        let mut episode = Episode::zeros(task.clone(), u64::MAX);
+        episode.kind = EpisodeKind::Evaluation;
+        episode.parameter_version = u64::MAX;
+        episode.advice_charged = u32::MAX;
+        episode.avoidance_steps = Some(u32::MAX);
+        episode.queried_steps = Some(u32::MAX);
+        let episodes = vec![encode_episode(&episode); 3];
+        let message = pb::SubmitEpisodesRequest { episodes, ..Default::default() };
+        let n_bytes = EncodedResponse::encode(&message).message_bytes();
+        let bound = 3 * max_episode_bytes(&task);
+        assert!((n_bytes..n_bytes + 3 * EPISODE_OVERHEAD_BYTES).contains(&bound), "{n_bytes}");
+    }
 }

@@ -110,6 +110,31 @@ async fn a_lost_account_is_reopened_with_the_remaining_budget() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_account_lost_several_times_in_a_row_is_reopened_each_time() {
+    for lag in [0, 1] {
+        for n_losses in [2, 3] {
+            let directory = tempfile::tempdir().expect("a directory");
+            let teacher = FakeTeacher::default();
+            let address = teacher.serve().await;
+            let run = advised(lag, AMPLE);
+            let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+            let mut toy = served.join("toy").await;
+            for _ in 0..5 {
+                assert!(play_one(&mut toy, &teacher).await);
+            }
+            teacher.books().n_losses = n_losses;
+            while play_one(&mut toy, &teacher).await {}
+            let ended = served.end().await.expect("the run ends");
+            assert!(!ended.interrupted);
+            let books = teacher.books();
+            assert_eq!((books.n_losses, books.opened.len()), (0, 1 + n_losses));
+            let rows = Left::behind(&ended, directory.path()).rows;
+            assert_eq!(rows.last().expect("rows").advice_spent, books.charged_ever);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_run_waits_for_its_teacher_and_can_be_stopped_meanwhile() {
     for lag in [0, 1] {
         let (expected, teacher) = calm(advised(lag, AMPLE)).await;

@@ -1,11 +1,13 @@
 //! Refused messages of workers, none of which has an effect.
 
-use tandem_core::Episode;
+use tandem_core::task::TaskDescription;
+use tandem_core::{Episode, EpisodeKind};
+use tandem_learner::Error;
 use tandem_proto::{encode_episode, pb};
 use tonic::{Code, Status};
 
 use crate::service_tests::run::{Left, Served, Toy, VERSION, calm, learner_config};
-use crate::service_tests::toy::config;
+use crate::service_tests::toy::{LAYOUT, config};
 
 type Spoil = fn(&mut pb::SubmitEpisodesRequest);
 
@@ -133,4 +135,35 @@ async fn workers_that_cannot_join_get_the_reason() {
     join(&"Arm №3 – left ".repeat(8), VERSION).await.expect("any other label will do");
     served.shutdown.cancel();
     served.end().await.expect("interrupted");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_whose_slots_exceed_a_message_is_refused_with_the_settings_to_change() {
+    let mib = |n_bytes: usize| n_bytes.div_ceil(1 << 20);
+    let described = "episode_steps or n_observation of the task's description";
+    for (n_observation, episode_steps, rollouts, kind, size_mib, settings) in [
+        (4096, 1000, 2, EpisodeKind::Evaluation, 126, described.to_owned()),
+        (376, 1000, 64, EpisodeKind::Training, 93, format!("rounds.rollouts, or {described}")),
+    ] {
+        let description = TaskDescription {
+            name: "lab/push".to_owned(),
+            n_observation,
+            episode_steps,
+            observation_bound: vec![3.0; n_observation],
+            ..LAYOUT.description()
+        };
+        let mut run = config(0);
+        run.task = description.name.clone();
+        run.description = Some(description);
+        run.rounds.rollouts = rollouts;
+        let directory = tempfile::tempdir().expect("a directory");
+        let served = Served::start(learner_config(run, directory.path(), false)).await;
+        let error = served.end().await.expect_err("cannot be sent");
+        let Error::SlotTooLarge { n_bytes, kind: refused } = &error else { panic!("{error:?}") };
+        assert_eq!((mib(*n_bytes), *refused), (size_mib, kind));
+        let expected = format!(
+            "the episodes of a slot are up to {size_mib} MiB large and a message at most 64: lower {settings}"
+        );
+        assert_eq!(error.to_string(), expected);
+    }
 }

@@ -1,10 +1,10 @@
 //! Workers that die, and a learner whose own thread does.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use tandem_learner::{Error, LearnerConfig};
+use tandem_learner::{Clock, Error, LearnerConfig};
 use tandem_proto::pb;
 use tandem_proto::pb::next_work_response::Work;
 
@@ -55,8 +55,9 @@ async fn a_worker_that_plays_beyond_the_end_receives_it() {
 async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
-    // The clock does not advance, so no worker is slow or silent.
-    let clock = Arc::new(|| Duration::ZERO);
+    // The clock does not advance before the end, so no worker is slow or silent.
+    let seconds = Arc::new(AtomicU64::new(0));
+    let clock = clock_of(&seconds);
     let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
     let served = Served::start(config).await;
     let (mut gone, mut alive) = (served.join("gone").await, served.join("alive").await);
@@ -64,8 +65,42 @@ async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     drop(gone);
     let played = async { while alive.play_one().await {} };
     tokio::time::timeout(DEADLINE, played).await.expect("every slot is to be had");
+    // The disconnected worker might still be playing, until it counts as dead.
+    seconds.store(15, Ordering::Relaxed);
     let ended = served.end().await.expect("a run");
     assert_eq!(Left::behind(&ended, directory.path()), expected);
+}
+
+/// Returns a clock that shows `seconds`.
+fn clock_of(seconds: &Arc<AtomicU64>) -> Clock {
+    let seconds = seconds.clone();
+    Arc::new(move || Duration::from_secs(seconds.load(Ordering::Relaxed)))
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_disconnected_worker_that_plays_beyond_the_end_receives_it() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let seconds = Arc::new(AtomicU64::new(0));
+    let clock = clock_of(&seconds);
+    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
+    let served = Served::start(config).await;
+    let (mut cut, mut other) = (served.join("cut").await, served.join("other").await);
+    let mut leaving = served.join("leaving").await;
+    let (order, episodes) = cut.take().await.expect("a slot");
+    // Its connection ends. The learner does not wait for the worker that leaves without a slot.
+    cut.client = served.client().await;
+    assert!(leaving.play_one().await);
+    drop(leaving);
+    while other.play_one().await {}
+    // Far longer than the learner stays for those who have nothing to do.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    seconds.store(3, Ordering::Relaxed);
+    cut.deliver(order.slot, &episodes).await.expect("the learner is still there");
+    match cut.ask().await {
+        Ok(Work::Finished(finished)) => assert!(!finished.interrupted, "{}", finished.reason),
+        other => panic!("{other:?}"),
+    }
+    assert!(!served.end().await.expect("a run").interrupted);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

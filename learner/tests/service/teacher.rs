@@ -24,6 +24,8 @@ pub(crate) struct Books {
     pub(crate) accounts: BTreeMap<String, Account>,
     /// The error that every call returns, if set.
     pub(crate) refusal: Option<Status>,
+    /// Number of next requests for leases before which the accounts are lost.
+    pub(crate) n_losses: usize,
     /// Units charged by all accounts that there ever were, lost ones included.
     pub(crate) charged_ever: u64,
     /// The teacher's task, unless it is that of the toy.
@@ -155,6 +157,10 @@ impl Teacher for FakeTeacher {
         let pb::OpenLeasesRequest { account: name, episodes, units_per_episode } =
             request.into_inner();
         let mut books = self.books();
+        if books.n_losses > 0 {
+            books.n_losses -= 1;
+            books.accounts.clear();
+        }
         let account = books.account(&name)?;
         let mut leases = Vec::new();
         for episode in episodes {
