@@ -8,7 +8,7 @@ use tandem_core::task::MAX_ARMS;
 use tandem_core::{ArmAdvice, StepAdvice, StepQuery, TaskSpec};
 use tandem_proto::DecodeError;
 
-use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
+use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease};
 use crate::error::Error;
 use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
 use crate::maps::Maps;
@@ -98,7 +98,10 @@ impl Advisor {
     /// have, or the ledger cannot be used.
     pub fn open_account(&mut self, name: &str, terms: AccountTerms) -> Result<Balance, Error> {
         self.check_offered(terms.strategy)?;
-        Ok(self.ledger.open(name, terms)?)
+        let balance = self.ledger.open(name, terms)?;
+        // Another strategy is remembered if a server has lost the account in the meantime.
+        self.remember(name, balance.terms.strategy);
+        Ok(balance)
     }
 
     /// Returns the balance of account `name`.
@@ -160,6 +163,7 @@ impl Advisor {
             .collect();
         let charged = self.charge(&charges);
         self.warn_of_reused_steps(&charges, &charged);
+        self.forget_lost_accounts(&charges, &charged);
         let mut charged = charged.into_iter();
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
@@ -202,11 +206,15 @@ impl Advisor {
         }
         let strategy = self.ledger.balance(account)?.terms.strategy;
         self.check_offered(strategy)?;
+        self.remember(account, strategy);
+        Ok(strategy)
+    }
+
+    fn remember(&mut self, account: &str, strategy: Strategy) {
         if self.strategies.len() >= MAX_CACHED_STRATEGIES {
             self.strategies.clear();
         }
         self.strategies.insert(account.to_owned(), strategy);
-        Ok(strategy)
     }
 
     /// Refuses a strategy that needs values if the policy has none.
@@ -224,6 +232,19 @@ impl Advisor {
         let results = self.ledger.charge(requests);
         assert_eq!(results.len(), requests.len(), "a ledger answers every request");
         results
+    }
+
+    /// Forgets the strategies of accounts that a server has lost: they may be opened again with others, by other teachers.
+    fn forget_lost_accounts(
+        &mut self,
+        requests: &[ChargeRequest],
+        results: &[Result<ChargeResult, LedgerError>],
+    ) {
+        for (request, result) in requests.iter().zip(results) {
+            if matches!(result, Err(LedgerError::Budget(BudgetError::UnknownAccount(_)))) {
+                self.strategies.remove(&request.account);
+            }
+        }
     }
 
     /// Warns, once for each account, if a step was charged that the strategy would not charge now: the account remembers

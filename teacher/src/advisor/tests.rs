@@ -69,6 +69,22 @@ fn a_jump_start_ends_at_its_horizon_and_with_the_budget() {
 }
 
 #[test]
+fn a_lost_account_is_judged_by_the_strategy_with_which_it_is_opened_anew() {
+    let terms = |strategy: &str| AccountTerms { budget: 10, strategy: strategy.parse().unwrap() };
+    let mut advisor = advisor(10, "mc-q:0.25");
+    assert_eq!(ask(&mut advisor, &two_arms(0)).overridden_arms(), 0b00);
+    advisor.ledger = Box::new(MemoryLedger::default());
+    advisor.open_account("run", terms("ea")).unwrap();
+    assert_eq!(ask(&mut advisor, &two_arms(0)).overridden_arms(), 0b11);
+
+    // Another teacher opens it.
+    advisor.ledger = Box::new(MemoryLedger::default());
+    advise(&mut advisor, "run", &[two_arms(0)]).unwrap_err();
+    advisor.ledger.open("run", terms("mc-q:0.25")).unwrap();
+    assert_eq!(ask(&mut advisor, &two_arms(0)).overridden_arms(), 0b00);
+}
+
+#[test]
 fn advice_on_a_step_that_was_decided_before_is_marked() {
     let advisor = &mut advisor(10, "ea");
     assert!(!ask(advisor, &two_arms(0)).repeated);
