@@ -9,7 +9,7 @@ use tandem_core::Task;
 
 use crate::cli::{BenchArgs, BenchName};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, output, policy_file};
+use crate::{clock, output, policy_file, program};
 
 mod record;
 mod scale;
@@ -82,7 +82,7 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
 /// before it is removed.
 fn short_run<T>(options: &[&str], inspect: impl FnOnce(&Path) -> T) -> Result<(Value, T), Failed> {
     let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
-    let program = std::env::current_exe().or_exit(Exit::Bug, String::new)?;
+    let program = program::file().or_exit(Exit::Bug, String::new)?;
     let run = std::process::Command::new(program)
         .args(["train", "--json", "--max-minutes", "0"])
         .args(options)

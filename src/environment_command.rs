@@ -15,7 +15,7 @@ use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::Mutex;
 
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{runtime, signals};
+use crate::{program, runtime, signals};
 
 /// The variable with the address on which the command listens.
 const LISTEN_VARIABLE: &str = "TANDEM_ENV_LISTEN";
@@ -58,8 +58,9 @@ impl CommandServer {
         let failed = |reason: String| {
             ServerNotStarted(format!("the environment command {:?} {reason}", self.command))
         };
-        let spawned = std::env::current_exe().and_then(|program| {
-            Command::new(program)
+        let spawned = program::file().and_then(|file| {
+            Command::new(file)
+                .arg0(program::name())
                 .arg("env-guard")
                 .arg(&self.command)
                 .process_group(0)

@@ -17,25 +17,27 @@ use anyhow::{Context as _, anyhow};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
-use crate::clock;
+use crate::{clock, program};
 pub(crate) use log::{ProcessLog, last_line};
 
 /// Starts processes of one program whose standard error goes to one log.
 pub(crate) struct Launcher {
     program: PathBuf,
+    /// The name under which processes are started.
+    name: OsString,
     log: ProcessLog,
 }
 
 impl Launcher {
     /// Launches this program.
     pub(crate) fn new(log: ProcessLog) -> anyhow::Result<Self> {
-        let program = std::env::current_exe().context("cannot find this program's own file")?;
-        Ok(Self { program, log })
+        let program = program::file().context("cannot find this program's own file")?;
+        Ok(Self { program, name: program::name(), log })
     }
 
     /// Launches another build of this program.
-    pub(crate) const fn with_program(program: PathBuf, log: ProcessLog) -> Self {
-        Self { program, log }
+    pub(crate) fn with_program(program: PathBuf, log: ProcessLog) -> Self {
+        Self { name: program.clone().into(), program, log }
     }
 
     pub(crate) const fn log(&self) -> &ProcessLog {
@@ -47,6 +49,7 @@ impl Launcher {
     pub(crate) fn spawn(&self, args: &[OsString], stdout: Stdio) -> anyhow::Result<ChildProcess> {
         let log_offset = self.log.n_bytes();
         let child = Command::new(&self.program)
+            .arg0(&self.name)
             .args(args)
             .process_group(0)
             .kill_on_drop(true)
@@ -127,12 +130,14 @@ impl ChildProcess {
         Ok(lines)
     }
 
-    /// Asks the process to exit and waits for it; kills it after `deadline`.
-    pub(crate) async fn end(mut self, deadline: Duration) {
+    /// Asks the process to exit and waits for it; kills it after `deadline`. Returns whether it exited by itself.
+    pub(crate) async fn end(mut self, deadline: Duration) -> bool {
         drop(self.take_input());
-        if tokio::time::timeout(deadline, self.child.wait()).await.is_err() {
+        let exits = tokio::time::timeout(deadline, self.child.wait()).await.is_ok();
+        if !exits {
             drop(self.child.kill().await);
         }
+        exits
     }
 }
 

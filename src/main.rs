@@ -34,6 +34,7 @@ mod output;
 mod picture;
 mod policy;
 mod policy_file;
+mod program;
 mod progress_json;
 mod progress_text;
 mod replay;
@@ -58,6 +59,7 @@ use cli::{Cli, Command};
 use exit::{Exit, Failed};
 
 fn main() -> ExitCode {
+    program::set_process_name();
     signals::ignore_file_size_signal();
     let code = run();
     output::flush_messages();

@@ -38,8 +38,11 @@ use run_lock::RunLock;
 
 /// Timeout of the start of all processes.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time that the learner has to save and exit.
-const END_TIMEOUT: Duration = Duration::from_secs(60);
+/// Time that the learner has to finish the updates of a round, save and exit.
+const END_TIMEOUT: Duration = Duration::from_mins(10);
+/// What is printed when that was not enough.
+const NOT_SAVED: &str = "the learner did not save within 10 minutes and was killed: a resumed run continues from \
+                         its last checkpoint";
 /// Time between two checks of the processes.
 const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// Time between two samples of their memory.
@@ -102,7 +105,9 @@ async fn run(
     }
     let interrupted_again = signals::shutdown_token(false)?;
     tokio::select! {
-        () = processes.end(END_TIMEOUT) => (),
+        is_saved = processes.end(END_TIMEOUT) => if !is_saved {
+            display.print(NOT_SAVED);
+        },
         () = interrupted_again.cancelled() => (),
     }
     let last = last.map_err(|RunFailure { exit, error }| {

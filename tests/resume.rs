@@ -232,6 +232,44 @@ fn a_finished_run_can_be_extended() {
 }
 
 #[test]
+fn a_longer_run_file_keeps_the_interval_between_evaluations() {
+    let (keep, out) = directory();
+    let file = keep.path().join("short.toml");
+    let play = |program_args: &[&str], max_env_steps: u64| {
+        let settings = "name = \"run\"\n[advice]\nstrategy = \"none\"\n[rounds]\nrollouts = 1\nupdates_per_env_step = 0.1\n\
+                        [ddpg]\nn_hidden = 32\n[evaluation]\nepisodes = 8\ntest_episodes = 8\n";
+        let text = format!("{settings}[stop]\nmax_env_steps = {max_env_steps}\n");
+        fs::write(&file, text).expect("writable");
+        let ended = tandem(program_args, &out).arg("--run").arg(&file).output().expect("runs");
+        assert!(ended.status.success(), "{:?}: {}", ended.status, stderr(&ended));
+    };
+    play(&["train", "--json", "--workers", "2"], 1600);
+    play(&["train", "--json", "--workers", "2", "--resume"], 3200);
+    let settings = fs::read_to_string(out.join("run.toml")).expect("readable");
+    assert!(settings.contains("every_env_steps = 320\n"), "{settings}");
+    assert!(settings.contains("max_env_steps = 3200\n"), "{settings}");
+    // A finished run ends at once.
+    play(&["learner", "--start-or-resume"], 3200);
+}
+
+#[test]
+fn a_run_goes_on_with_its_own_program_after_another_has_taken_its_place() {
+    let (keep, out) = directory();
+    let program = keep.path().join("tandem");
+    fs::copy(env!("CARGO_BIN_EXE_tandem"), &program).expect("a copy");
+    let args = [&["train", "--json", "--workers", "2"], &SMALL[..]].concat();
+    let mut command = Command::new(&program);
+    command.args(args).arg("--out").arg(&out).current_dir(env!("CARGO_MANIFEST_DIR"));
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let run = command.spawn().expect("starts");
+    assert!(eventually(|| pids(&run, "worker").len() == 2), "the workers do not start");
+    fs::remove_file(&program).expect("removes");
+    fs::write(&program, "not a program").expect("writable");
+    kill_one(&run, "worker");
+    assert_eq!(digest(&run.wait_with_output().expect("ends")), UNDISTURBED.1);
+}
+
+#[test]
 fn a_run_without_a_checkpoint_keeps_the_settings_of_its_run_file() {
     let (_keep, out) = finished();
     fs::remove_dir_all(out.join("checkpoint")).expect("removes");

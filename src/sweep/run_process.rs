@@ -23,7 +23,7 @@ use crate::launch::{Launcher, ProcessLog, last_line};
 use crate::{environment_server, run_file};
 
 /// Time that a run has to save and exit.
-const END_TIMEOUT: Duration = Duration::from_secs(150);
+const END_TIMEOUT: Duration = Duration::from_mins(11);
 /// Time between two attempts to lock the log.
 const RETRY_EVERY: Duration = Duration::from_millis(100);
 

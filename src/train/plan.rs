@@ -231,14 +231,17 @@ fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Fa
         return Err(run_directory::no_run(&format!("{} holds no run to resume", out.display())));
     }
     let settings = [served_settings(args, served)?, settings_of(args)?].concat();
-    let config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
+    let mut config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
     // A resumed run keeps the name in its own run file, even if --run names another one.
     match own_file.filter(|_| args.run.is_some() && !is_named) {
-        Some(own_file) => match run_file::resolve(Some(&own_file), &[]) {
-            Ok(RunConfig { name, .. }) => Ok(RunConfig { name, ..config }),
-            Err(_) => Ok(config),
-        },
+        Some(own_file) => {
+            run_file::keep_interval(&mut config, &own_file);
+            match run_file::resolve(Some(&own_file), &[]) {
+                Ok(RunConfig { name, .. }) => Ok(RunConfig { name, ..config }),
+                Err(_) => Ok(config),
+            }
+        }
         None => Ok(config),
     }
 }

@@ -180,8 +180,8 @@ impl RunProcesses {
     }
 
     /// Asks all processes to exit and waits for them. The learner, which saves its state, has until `deadline`. The
-    /// teacher, which settles the learner's leases, ends after it.
-    pub(crate) async fn end(&mut self, deadline: Duration) {
+    /// teacher, which settles the learner's leases, ends after it. Returns whether the learner exited by itself.
+    pub(crate) async fn end(&mut self, deadline: Duration) -> bool {
         let mut learner = None;
         let mut teacher = None;
         let mut workers = JoinSet::new();
@@ -193,13 +193,15 @@ impl RunProcesses {
                 Role::Worker => drop(workers.spawn(child.end(GRACE))),
             }
         }
-        if let Some(learner) = learner {
-            learner.end(deadline).await;
-        }
+        let is_saved = match learner {
+            Some(learner) => learner.end(deadline).await,
+            None => true,
+        };
         if let Some(teacher) = teacher {
             teacher.end(GRACE).await;
         }
         workers.join_all().await;
+        is_saved
     }
 
     /// Starts a service and returns its address. A service that a signal kills before it prints its address is

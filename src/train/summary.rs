@@ -41,8 +41,7 @@ pub(super) fn print(
     })?;
     let json = summary_json(plan, last, memory, &result).to_string();
     save(&plan.out, &json).map_err(|failed| failed.context(saved()))?;
-    let pages = films(&result).and_then(|films| RunPages::write(&plan.config, &plan.out, &films));
-    let pages = pages.map_err(|failed| failed.context(saved()))?;
+    let (result, pages) = pages(plan, result, args).map_err(|failed| failed.context(saved()))?;
     let summary = match args.json {
         true => json,
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
@@ -79,6 +78,19 @@ fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
     let subject = EvaluatedPolicy::new(policy, &path)?;
     signals::unless_interrupted(args.exit_with_stdin, move || {
         measure(&subject, n_episodes, TEST_SEED)
+    })
+}
+
+/// Writes the pages of the run, which show episodes of the test.
+fn pages(
+    plan: &Plan,
+    result: EvaluationResult,
+    args: &TrainArgs,
+) -> Result<(EvaluationResult, RunPages), Failed> {
+    let (config, out) = (plan.config.clone(), plan.out.clone());
+    signals::unless_interrupted(args.exit_with_stdin, move || {
+        let pages = RunPages::write(&config, &out, &films(&result)?)?;
+        Ok((result, pages))
     })
 }
 
