@@ -3,7 +3,8 @@
 //! **Procedure.** One joint after the other turns by a few degrees out and back at a share of its speed, which gives
 //! the lag, and is then stopped several times in the middle of such a turn, which gives the reaction and the braking
 //! time. An [`Executor`] plays every turn, so all checks and the envelope apply with the settings that hold until the
-//! measurement. Only one joint moves at a time.
+//! measurement. Only one joint moves at a time. The arms are reset after intended stops and after delays of the
+//! machine; any other stop ends the measurement, also one that would follow while the arms are stopped already.
 //!
 //! **What is measured.** The *lag* is the delay of measured angles behind the sum of the commanded velocities. The
 //! *reaction* is the time from the stamp of the newest state at the time of a stop until the joint begins to brake: the
@@ -38,6 +39,8 @@ const N_STOPS: usize = 3;
 const N_ATTEMPTS: usize = 5;
 /// Time for which the arms are watched after a stop, seconds.
 const WATCH_S: f64 = 0.5;
+/// Time after a delay in which drives may report that they have braked because of it, seconds.
+const DELAY_EFFECT_S: f64 = 0.2;
 /// Time in which the states must become good, seconds.
 const READY_S: f64 = 3.0;
 /// Share of the constant part of a turn after which it is stopped.
@@ -172,7 +175,8 @@ pub fn calibrate(
         is_interrupted,
         ramp_s: settings.check.limits.ramp_s,
         at_s,
-        was_held_up: false,
+        ticked_s: at_s,
+        delayed_s: f64::NEG_INFINITY,
     };
     let mut timings = Vec::with_capacity(cell.arms.len());
     for (arm, placed) in cell.arms.iter().enumerate() {
@@ -196,6 +200,12 @@ fn of_arm(joints: &[ArmTiming], period_s: f64) -> ArmTiming {
     ArmTiming { lag_s, reaction_s, brake_s: slowest(|joint| joint.brake_s) }
 }
 
+/// Returns whether the cause is that commands, states or their effects were late.
+fn is_delay(cause: &StopCause) -> bool {
+    use StopCause as C;
+    matches!(cause, C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_))
+}
+
 /// The arms while they are measured.
 struct Bench<'a> {
     cell: &'a WorkCell,
@@ -204,10 +214,12 @@ struct Bench<'a> {
     clock: &'a dyn Clock,
     is_interrupted: &'a dyn Fn() -> bool,
     ramp_s: f64,
-    /// The time of the last tick.
+    /// The time for which the last tick was due.
     at_s: f64,
-    /// Whether the last exchange took so long that the drives braked by themselves.
-    was_held_up: bool,
+    /// The time at which it began.
+    ticked_s: f64,
+    /// The end of the last delay that may have made the drives brake by themselves.
+    delayed_s: f64,
 }
 
 impl Bench<'_> {
@@ -277,23 +289,41 @@ impl Bench<'_> {
         self.executor
             .acquire(OWNER, now_s)
             .map_err(|error| CalibrationError::Start(error.into()))?;
+        let since_s = now_s - std::mem::replace(&mut self.ticked_s, now_s);
         let phase = self.executor.tick(now_s);
-        self.was_held_up = self.clock.now_s() - now_s >= SILENCE_S - self.executor.period_s();
+        let end_s = self.clock.now_s();
+        let newest = self.executor.newest_stop().filter(|stop| stop.when_s >= now_s);
+        if since_s.max(end_s - now_s) >= SILENCE_S - self.executor.period_s()
+            || newest.is_some_and(|stop| is_delay(&stop.cause))
+        {
+            self.delayed_s = end_s;
+        }
         Ok(phase)
     }
 
     /// Returns whether a machine that is too slow explains the stop. Drives that wait too long for a command report a
     /// fault, too; any other fault needs a person.
     fn was_late(&self, stop: &Stop) -> bool {
-        use StopCause as C;
-        match stop.cause {
-            C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_) => true,
-            C::DriveFault => self.was_held_up,
-            _ => false,
-        }
+        let explains_fault = stop.when_s - self.delayed_s <= DELAY_EFFECT_S;
+        is_delay(&stop.cause) || stop.cause == StopCause::DriveFault && explains_fault
     }
 
-    /// Resets the arms if they are stopped, and waits until they are at rest.
+    /// Returns the first or the newest cause of the present stop if it needs a person before the arms are reset.
+    /// Intended stops and delays do not, nor do drives that become ready only when commands arrive.
+    fn needs_person(&self) -> Option<&Stop> {
+        use StopCause as C;
+        let first = self.executor.stopped_by()?;
+        let is_new = first.cause == C::NotReset;
+        let needs = |stop: &&Stop| match stop.cause {
+            C::NotReset | C::Requested => false,
+            C::EmergencyStop | C::ContactReported | C::Torque(_) => true,
+            C::DriveFault if is_delay(&first.cause) => false,
+            _ => !is_new && !self.was_late(stop),
+        };
+        [Some(first), self.executor.newest_stop()].into_iter().flatten().find(needs)
+    }
+
+    /// Resets the arms if they are stopped and no person is needed, and waits until they are at rest.
     fn ready(&mut self) -> Result<(), CalibrationError> {
         let until_s = self.clock.now_s() + READY_S;
         loop {
@@ -304,6 +334,9 @@ impl Bench<'_> {
             }
             if phase != Phase::Stopped {
                 continue;
+            }
+            if let Some(stop) = self.needs_person() {
+                return Err(CalibrationError::Stopped(stop.clone()));
             }
             match self.executor.reset(OWNER, now_s) {
                 Err(error) if now_s > until_s => {
@@ -398,7 +431,7 @@ impl Bench<'_> {
         let until_s = self.clock.now_s() + WATCH_S;
         while self.clock.now_s() < until_s {
             self.tick()?;
-            if let Some(stop) = self.executor.stopped_by()
+            if let Some(stop) = self.executor.newest_stop()
                 && stop.cause != StopCause::Requested
             {
                 return Err(CalibrationError::Stopped(stop.clone()));
@@ -412,7 +445,7 @@ impl Bench<'_> {
     }
 
     fn stopped(&self) -> CalibrationError {
-        match self.executor.stopped_by() {
+        match self.needs_person().or(self.executor.stopped_by()) {
             Some(stop) => CalibrationError::Stopped(stop.clone()),
             None => CalibrationError::Start(StartError::NoState),
         }

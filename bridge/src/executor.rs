@@ -60,6 +60,8 @@ pub struct Executor<D: Driver> {
     envelope: Envelope,
     state: ArmsState,
     commands: CommandHistory,
+    /// The newest cause after the one for which the arms were stopped.
+    later_stop: Option<Stop>,
     ticked_s: Option<f64>,
     /// The error of the last attempt to stop the drives, until a command gets through.
     stop_error: Option<DriverError>,
@@ -81,6 +83,7 @@ impl<D: Driver> Executor<D> {
             envelope: Envelope::new(&cell, &settings, period_s),
             state: ArmsState::Stopped(StopCause::NotReset.anywhere().at(0.0)),
             commands: CommandHistory::new(&cell, &settings, period_s),
+            later_stop: None,
             ticked_s: None,
             stop_error: None,
             exchange_error: None,
@@ -295,6 +298,12 @@ impl<D: Driver> Executor<D> {
         self.state.stop()
     }
 
+    /// The newest cause for which the arms would be stopped if they were not, while they are stopped.
+    #[must_use]
+    pub fn newest_stop(&self) -> Option<&Stop> {
+        self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))
+    }
+
     /// The error of the last attempt to stop the drives, until a command gets through.
     #[must_use]
     pub fn stop_error(&self) -> Option<&DriverError> {
@@ -332,6 +341,14 @@ impl<D: Driver> Executor<D> {
     #[must_use]
     pub fn reference(&self) -> Option<&[Joints]> {
         self.state.playback().map(Playback::reference)
+    }
+
+    /// The commanded openings of the grippers, arm by arm; `None` while the arms are stopped. A gripper that holds an
+    /// object is open wider than commanded.
+    #[must_use]
+    pub fn openings(&self) -> Option<Vec<f64>> {
+        let is_stopped = self.phase() == Phase::Stopped;
+        (!is_stopped).then(|| self.commands.last().iter().map(|arm| arm.opening).collect())
     }
 
     /// The driver, for inspection.
@@ -399,30 +416,34 @@ impl<D: Driver> Executor<D> {
         Ok(Order::Move(commands))
     }
 
-    /// Ends a motion whose arms rest at its end.
+    /// Ends a motion whose arms rest at its end and whose grippers have received its last openings.
     fn settle(&mut self) -> Result<(), Breach> {
         let (ArmsState::Playing { playback, holding: false }, Some(state)) =
             (&self.state, self.monitor.state())
         else {
             return Ok(());
         };
-        if playback.since_end_s() <= 0.0 {
+        if playback.settling_s() <= 0.0 {
             return Ok(());
         }
         let (got, allowed) = (playback.distance_to_end(state), self.settings.settled_rad);
         let at_rest = self.commands.at_rest(self.settings.rest_radps) && self.monitor.at_rest();
         if got <= allowed && at_rest {
             self.state = ArmsState::Idle { at: playback.reference().to_vec() };
-        } else if playback.since_end_s() > self.settings.settle_s {
+        } else if playback.settling_s() > self.settings.settle_s {
             return Err(StopCause::NotSettled(Excess { got, allowed }).anywhere());
         }
         Ok(())
     }
 
-    /// Stops the arms in the fastest way. The first cause is kept.
+    /// Stops the arms in the fastest way. The first cause is kept, and the newest one beside it.
     fn halt(&mut self, breach: Breach, now_s: f64) {
-        if !matches!(self.state, ArmsState::Stopped(_)) {
-            self.state = ArmsState::Stopped(breach.at(now_s));
+        let stop = breach.at(now_s);
+        if matches!(self.state, ArmsState::Stopped(_)) {
+            self.later_stop = Some(stop);
+        } else {
+            self.state = ArmsState::Stopped(stop);
+            self.later_stop = None;
         }
         // If this fails, the next command repeats the stop, and without commands the drives brake by themselves.
         self.stop_error = self.driver.stop().err();

@@ -303,7 +303,7 @@ impl BridgeService {
         let checker = self.arms.checker.clone();
         let checking = tokio::task::spawn_blocking(move || {
             let _turn = turn;
-            spec.prepare(&state, &checker).map(then)
+            spec.prepare(&state, newest.openings.as_deref(), &checker).map(then)
         });
         Ok(checking.await.map_err(|_panic| Error::Panicked)??)
     }

@@ -107,7 +107,7 @@ impl Monitor {
         let (reported, measured) = match ordered {
             Ok(late_s) => {
                 let reported = self.check_reports(&state);
-                (reported, self.check_measurements(&state, expected, late_s))
+                (reported, self.check_measurements(now_s, &state, expected, late_s))
             }
             Err(breach) => (Ok(()), Err(breach)),
         };
@@ -135,16 +135,17 @@ impl Monitor {
         Ok(())
     }
 
-    /// Checks that the measurements can be true, and that commands take effect. The state is `late_s` seconds later than
-    /// usual.
+    /// Checks that the measurements can be true, and that commands take effect. The state is received at `now_s`,
+    /// `late_s` seconds later than usual.
     fn check_measurements(
         &mut self,
+        now_s: f64,
         state: &PairState,
         expected: &ExpectedState<'_>,
         late_s: f64,
     ) -> Result<(), Breach> {
         for (arm, reading) in state.arms.iter().enumerate() {
-            self.check_motion(arm, state.stamp_s, reading)?;
+            self.check_motion(arm, now_s, state.stamp_s, reading)?;
             self.check_frozen(arm, reading, &expected.velocities[arm])?;
         }
         self.check_effect(state, expected.number, late_s)
@@ -210,8 +211,16 @@ impl Monitor {
         Ok(())
     }
 
-    /// Checks that no joint is faster than it can be, by its rate and by the change of its angle.
-    fn check_motion(&self, arm: usize, stamp_s: f64, reading: &ArmReading) -> Result<(), Breach> {
+    /// Checks that no joint is faster than it can be, by its rate and by the change of its angle. The time stamp of a
+    /// state is that of its oldest measurement. Arms that were measured later may have turned for longer than from
+    /// stamp to stamp, but hardly for longer than from receipt to receipt.
+    fn check_motion(
+        &self,
+        arm: usize,
+        now_s: f64,
+        stamp_s: f64,
+        reading: &ArmReading,
+    ) -> Result<(), Breach> {
         for (joint, limits) in self.models[arm].joints.iter().enumerate() {
             let allowed = self.settings.overspeed_share * limits.speed_radps;
             let got = reading.velocities[joint].abs();
@@ -220,7 +229,7 @@ impl Monitor {
             }
             if let Some(seen) = &self.newest {
                 let before = seen.state.arms[arm].angles[joint];
-                let since_s = stamp_s - seen.state.stamp_s;
+                let since_s = (stamp_s - seen.state.stamp_s).max(now_s - seen.at_s);
                 let allowed = allowed * since_s + self.settings.jump_rad;
                 let got = (reading.angles[joint] - before).abs();
                 if got > allowed {
@@ -280,5 +289,43 @@ fn check_faults(arm: usize, reading: &ArmReading) -> Result<(), Breach> {
         Err(StopCause::ContactReported.of(arm))
     } else {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::driver::Faults;
+    use crate::work_cell::mico_cell;
+
+    /// Arms whose first joints turned by these angles, radians.
+    fn state(sequence: u64, stamp_s: f64, turned: [f64; 2]) -> PairState {
+        let reading = |turned: f64| ArmReading {
+            angles: Joints::from_fn(4, |joint| if joint == 0 { turned } else { 0.0 }),
+            velocities: Joints::from_fn(4, |_| 0.0),
+            torques_nm: None,
+            opening: 1.0,
+            faults: Faults::default(),
+        };
+        let arms = turned.map(reading).to_vec();
+        PairState { sequence, stamp_s, newest_command: None, arms }
+    }
+
+    #[test]
+    fn an_arm_that_was_measured_after_the_stamp_may_have_turned_for_longer() {
+        let cell = mico_cell();
+        let settings = Settings { state_hold_s: 0.13, state_stop_s: 0.25, ..Settings::default() };
+        let velocities = vec![Joints::from_fn(4, |_| 0.0); 2];
+        let expected = ExpectedState { number: 0, velocities: &velocities };
+        let fastest = cell.arms[1].model.joints[0].speed_radps;
+        let second = |turned: f64| {
+            let mut monitor = Monitor::new(&cell, &settings, 0.01);
+            // The first arm reports at 0.24 s, 40 ms late, and at 0.30 s; the second one at 0.25 s and 0.35 s.
+            monitor.accept(100.25, state(1, 0.24, [0.0; 2]), &expected).unwrap();
+            monitor.accept(100.35, state(2, 0.30, [0.06 * fastest, turned]), &expected)
+        };
+        assert_eq!(second(0.10 * fastest), Ok(()));
+        let jump = second(0.14 * fastest + settings.jump_rad).unwrap_err();
+        assert!(matches!(jump.cause, StopCause::AngleJump(_)), "{jump:?}");
     }
 }

@@ -2,12 +2,15 @@
 
 use std::collections::VecDeque;
 
-use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
+use tandem_kinematics::{ArmSample, Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::envelope::reachable;
 use crate::executor::settings::Settings;
 use crate::executor::stop::{Breach, StopCause};
+
+/// Openings that are no further apart than this are equal.
+const OPENING_TOLERANCE: f64 = 1e-6;
 
 /// A motion and its progress.
 #[derive(Debug, Clone)]
@@ -21,6 +24,8 @@ pub(crate) struct Playback {
     played_s: f64,
     /// The time since the end of the motion, seconds.
     since_end_s: f64,
+    /// The part of that time in which the grippers were not yet commanded to their last openings, seconds.
+    opening_s: f64,
     /// The references of the last periods, the newest first.
     references: VecDeque<Vec<Joints>>,
 }
@@ -43,7 +48,8 @@ impl Playback {
     pub(crate) fn new(motion: Motion, speed: f64) -> Self {
         let at: Vec<Joints> = motion.at(0.0).into_iter().map(|sample| sample.angles).collect();
         let references = VecDeque::from([at]);
-        Self { motion, speed, rate: speed, played_s: 0.0, since_end_s: 0.0, references }
+        let (rate, played_s, since_end_s, opening_s) = (speed, 0.0, 0.0, 0.0);
+        Self { motion, speed, rate, played_s, since_end_s, opening_s, references }
     }
 
     pub(crate) fn played_s(&self) -> f64 {
@@ -57,6 +63,12 @@ impl Playback {
     /// The time since the end of the motion, seconds; 0 before the end.
     pub(crate) fn since_end_s(&self) -> f64 {
         self.since_end_s
+    }
+
+    /// The time since the end of the motion and since the grippers are commanded to their last openings, seconds; 0
+    /// before.
+    pub(crate) fn settling_s(&self) -> f64 {
+        self.since_end_s - self.opening_s
     }
 
     /// The joint angles that the motion prescribes now, radians.
@@ -89,7 +101,13 @@ impl Playback {
             let opening = to[arm].gripper_opening.clamp(last - opening_step, last + opening_step);
             ArmCommand { velocities: within_limits(context, arm, &ahead), opening }
         };
-        let commands = (0..from.len()).map(command).collect();
+        let commands: Vec<ArmCommand> = (0..from.len()).map(command).collect();
+        let opens = |(to, command): (&ArmSample, &ArmCommand)| {
+            (to.gripper_opening - command.opening).abs() > OPENING_TOLERANCE
+        };
+        if to.iter().zip(&commands).any(opens) {
+            self.opening_s = self.since_end_s;
+        }
         self.references.push_front(to.into_iter().map(|sample| sample.angles).collect());
         self.references.truncate(Self::n_references(context));
         Ok(commands)

@@ -29,7 +29,7 @@ pub struct Settings {
     pub tracking_rad: f64,
     /// Largest distance of a settled joint from the motion's end, radians.
     pub settled_rad: f64,
-    /// Longest time for the arms to settle after the motion's end, seconds.
+    /// Longest time for the arms to settle after the motion's end and the last change of an opening, seconds.
     pub settle_s: f64,
     /// Largest change of an angle between two states beyond what the highest speed explains, radians.
     pub jump_rad: f64,

@@ -69,10 +69,12 @@ impl MotionSpec {
         Ok(Self { path, speed })
     }
 
-    /// Plans the motion from the position of the arms, if necessary, and checks it.
+    /// Plans the motion from the position of the arms, if necessary, and checks it. `openings` are the commanded ones,
+    /// arm by arm; `None` if the arms are stopped.
     pub(super) fn prepare(
         self,
         state: &PairState,
+        openings: Option<&[f64]>,
         checker: &Checker,
     ) -> Result<CheckedMotion, MotionError> {
         let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
@@ -80,7 +82,7 @@ impl MotionSpec {
             MotionPath::JointSamples(motion) => motion,
             MotionPath::Waypoints { mut waypoints, step_s, from_here } => {
                 if from_here {
-                    waypoints.insert(0, tool_positions(state, checker.cell()));
+                    waypoints.insert(0, tool_positions(state, openings, checker.cell()));
                 }
                 let limits = checker.settings().check.limits;
                 let settings = PlanSettings { limits, step_s, ..PlanSettings::default() };
@@ -97,17 +99,20 @@ impl MotionSpec {
     }
 }
 
-/// The present positions of the tools.
-fn tool_positions(state: &PairState, cell: &WorkCell) -> Waypoint {
-    let arms = state.arms.iter().zip(&cell.arms);
-    let waypoint = |(arm, placed): (&crate::ArmReading, &tandem_kinematics::PlacedArm)| {
-        let tool = ForwardKinematics::new(placed.model, &arm.angles).tool_m();
+/// The present positions of the tools, with the commanded openings if there are any. A gripper that holds an object is
+/// open wider than commanded, and would let go of it on the way from the measured opening. A reset takes over the
+/// measured openings.
+fn tool_positions(state: &PairState, openings: Option<&[f64]>, cell: &WorkCell) -> Waypoint {
+    let waypoint = |(arm, placed): (usize, &tandem_kinematics::PlacedArm)| {
+        let reading = &state.arms[arm];
+        let tool = ForwardKinematics::new(placed.model, &reading.angles).tool_m();
+        let opening = openings.map_or(reading.opening, |openings| openings[arm]);
         ArmWaypoint {
             tool_in_world_m: placed.world_from_base() * tool,
-            gripper_opening: arm.opening.clamp(0.0, 1.0),
+            gripper_opening: opening.clamp(0.0, 1.0),
         }
     };
-    arms.map(waypoint).collect()
+    cell.arms.iter().enumerate().map(waypoint).collect()
 }
 
 /// Returns the error with waypoints counted as the client counts them.

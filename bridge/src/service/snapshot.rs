@@ -30,6 +30,8 @@ pub struct Snapshot {
     pub at_rest: bool,
     /// The newest valid state of the arms.
     pub state: Option<PairState>,
+    /// The commanded openings of the grippers, arm by arm; `None` while the arms are stopped.
+    pub openings: Option<Vec<f64>>,
     /// The joint angles that the motion prescribes, radians, arm by arm.
     pub reference: Option<Vec<Joints>>,
     /// The motion in progress.
@@ -171,6 +173,7 @@ mod tests {
                 lease_left_s: None,
                 at_rest: true,
                 state: None,
+                openings: None,
                 reference: None,
                 motion: None,
                 progress: None,

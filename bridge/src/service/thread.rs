@@ -325,6 +325,7 @@ fn snapshot(executor: &Executor<BoxDriver>, now_s: f64) -> Snapshot {
         lease_left_s: executor.lease_left_s(now_s),
         at_rest: executor.at_rest(),
         state: executor.state().cloned(),
+        openings: executor.openings(),
         reference: executor.reference().map(<[Joints]>::to_vec),
         motion: None,
         progress: executor.progress(),

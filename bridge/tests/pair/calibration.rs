@@ -7,12 +7,12 @@ use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibr
 use tandem_bridge::cell_file::ArmTiming;
 use tandem_bridge::service::{BoxDriver, Clock};
 use tandem_bridge::work_cell::mico_cell;
-use tandem_bridge::{Command, Driver, DriverError, Order, PairState, Settings};
+use tandem_bridge::{Command, Driver, DriverError, Faults, Order, PairState, Settings};
 use tandem_trials::simulated::PERIOD_S;
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 
 /// A clock that advances when its user sleeps.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub(crate) struct SleepClock(AtomicU64);
 
 impl Clock for SleepClock {
@@ -70,10 +70,31 @@ fn the_simulated_pair_has_the_times_it_was_configured_with() {
     }
 }
 
-/// Arms that record what they are told.
+/// Arms that record what they are told, and may report faults in a single state.
 struct Watched {
     pair: SimulatedPair,
     told: Arc<Mutex<Told>>,
+    faults: Option<(After, Faults)>,
+}
+
+/// The event after which faults are reported.
+#[derive(Debug, Clone)]
+enum After {
+    /// The first reset, immediately.
+    Reset,
+    /// The first intended stop, by 100 ms.
+    Stop,
+    /// The same, and it takes 60 ms by this clock.
+    DelayedStop(Arc<SleepClock>),
+}
+
+impl After {
+    fn is_now(&self, told: &Told) -> bool {
+        match self {
+            Self::Reset => told.n_moves == 1,
+            Self::Stop | Self::DelayedStop(_) => told.n_stops == 10,
+        }
+    }
 }
 
 #[derive(Default)]
@@ -84,6 +105,11 @@ struct Told {
     speed: f64,
     newest: Option<Order>,
     n_exchanges: usize,
+    n_moves: usize,
+    /// Stops since a joint moved.
+    n_stops: usize,
+    /// Moves since the report of the faults; `None` before.
+    n_moves_after: Option<usize>,
 }
 
 impl Driver for Watched {
@@ -96,6 +122,8 @@ impl Driver for Watched {
         told.n_exchanges += 1;
         told.newest = Some(command.order.clone());
         if let Order::Move(arms) = &command.order {
+            told.n_moves += 1;
+            told.n_moves_after = told.n_moves_after.map(|n| n + 1);
             let joints = || {
                 self.pair.cell().arms.iter().zip(arms).flat_map(|(placed, arm)| {
                     arm.velocities
@@ -107,8 +135,21 @@ impl Driver for Watched {
             // Feedback moves the other joints a little.
             told.n_joints = told.n_joints.max(joints().filter(|share| *share > 0.05).count());
             told.speed = told.speed.max(joints().fold(0.0, f64::max));
+        } else if told.speed > 0.0 {
+            told.n_stops += 1;
         }
-        self.pair.exchange(command)
+        let mut state = self.pair.exchange(command)?;
+        if let Some((after, faults)) = &self.faults
+            && told.n_moves_after.is_none()
+            && after.is_now(&told)
+        {
+            if let After::DelayedStop(clock) = after {
+                clock.sleep_until(clock.now_s() + 0.06);
+            }
+            state.arms[1].faults = *faults;
+            told.n_moves_after = Some(0);
+        }
+        Ok(state)
     }
 
     fn stop(&mut self) -> Result<(), DriverError> {
@@ -122,7 +163,7 @@ fn one_joint_moves_at_a_time_and_an_interrupted_measurement_stops_the_arms() {
     let told = Arc::new(Mutex::new(Told::default()));
     let driver = || -> BoxDriver {
         let pair = pair(SimulatedConfig::default());
-        Box::new(Watched { pair, told: Arc::clone(&told) })
+        Box::new(Watched { pair, told: Arc::clone(&told), faults: None })
     };
     let clock = SleepClock::default();
     let n_measured = std::cell::Cell::new(0);
@@ -135,6 +176,58 @@ fn one_joint_moves_at_a_time_and_an_interrupted_measurement_stops_the_arms() {
     assert_eq!(told.newest, Some(Order::Stop), "the last order");
     assert_eq!(told.n_joints, 1);
     assert!(told.speed > 0.25 && told.speed < 0.36, "{}", told.speed);
+}
+
+/// Measures arms that report `faults` once. Returns the result and the number of moves after the report.
+fn measured_with(
+    after: After,
+    faults: Faults,
+    clock: &SleepClock,
+) -> (Result<Vec<ArmTiming>, CalibrationError>, usize) {
+    let told = Arc::new(Mutex::new(Told::default()));
+    let pair = pair(SimulatedConfig::default());
+    let faults = Some((after, faults));
+    let driver: BoxDriver = Box::new(Watched { pair, told: Arc::clone(&told), faults });
+    let operator = Operator { clock, report: &mut |_| (), is_interrupted: &|| false };
+    let ended = calibrate(&mico_cell(), driver, Settings::default(), 0.3, operator);
+    let n_moves_after = told.lock().unwrap().n_moves_after;
+    (ended, n_moves_after.unwrap())
+}
+
+#[test]
+fn a_brief_fault_of_arms_at_rest_ends_the_measurement() {
+    let contact = Faults { contact: true, ..Faults::default() };
+    let emergency_stop = Faults { emergency_stop: true, ..Faults::default() };
+    let drive = Faults { drive: true, ..Faults::default() };
+    for (faults, what) in [
+        (contact, "a contact is reported"),
+        (emergency_stop, "the emergency stop is pressed"),
+        (drive, "a drive reports a fault"),
+    ] {
+        for after in [After::Reset, After::Stop] {
+            let (ended, n_moves_after) =
+                measured_with(after.clone(), faults, &SleepClock::default());
+            let error = ended.unwrap_err().to_string();
+            let expected = format!("arm 1: {what}");
+            assert!(error.starts_with("the arms were stopped: at "), "{after:?}: {error}");
+            assert!(error.ends_with(&expected), "{after:?}: {error}");
+            assert_eq!(n_moves_after, 0, "{after:?}: {what}");
+        }
+    }
+}
+
+#[test]
+fn drives_that_braked_because_of_a_delay_are_reset() {
+    let clock = Arc::new(SleepClock::default());
+    let drive = Faults { drive: true, ..Faults::default() };
+    let (ended, _) = measured_with(After::DelayedStop(Arc::clone(&clock)), drive, &clock);
+    assert_eq!(ended.unwrap().len(), 2);
+    let emergency_stop = Faults { emergency_stop: true, ..drive };
+    let clock = Arc::new(SleepClock::default());
+    let after = After::DelayedStop(Arc::clone(&clock));
+    let (ended, n_moves_after) = measured_with(after, emergency_stop, &clock);
+    assert!(ended.is_err(), "{ended:?}");
+    assert_eq!(n_moves_after, 0);
 }
 
 #[test]

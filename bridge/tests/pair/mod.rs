@@ -2,6 +2,7 @@
 
 mod calibration;
 mod faults;
+mod grippers;
 mod injection;
 mod itself;
 mod observer;

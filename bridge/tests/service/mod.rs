@@ -2,6 +2,7 @@
 
 mod calls;
 mod drills;
+mod grasp;
 mod inputs;
 mod rig;
 mod stops;

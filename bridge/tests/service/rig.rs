@@ -14,7 +14,7 @@ use tandem_kinematics::{ArmSample, Joints, Motion};
 use tandem_net::ServerConfig;
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
-use tandem_trials::simulated::Drill;
+use tandem_trials::simulated::{Block, Drill};
 use tandem_trials::{SimulatedConfig, SimulatedPair};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
@@ -112,6 +112,8 @@ pub(crate) struct Bench {
     connection: usize,
     /// The first command of the present connection.
     first: Option<Command>,
+    /// The widest commanded opening of a gripper since it was last read.
+    widest: f64,
 }
 
 /// The bench and the number of this connection to it.
@@ -119,14 +121,14 @@ pub(crate) struct Bench {
 pub(crate) struct Tap(Arc<(Mutex<Bench>, Condvar)>, usize);
 
 impl Tap {
-    fn new(seed: u64, injector: Injector, settings: &Settings) -> Self {
+    fn new(config: SimulatedConfig, injector: Injector, settings: &Settings) -> Self {
         let cell = mico_cell();
         let at = cell.ready(0.05).unwrap();
-        let config = SimulatedConfig { seed, ..SimulatedConfig::default() };
         let pair = SimulatedPair::new(cell, &at, 0.5, config);
         let drill = Drill::new(injector, settings);
         let (fault, newest) = (Fault::None, Order::Stop);
-        let bench = Bench { pair, drill, fault, n_stops: 0, newest, connection: 0, first: None };
+        let (n_stops, connection, first, widest) = (0, 0, None, 0.0);
+        let bench = Bench { pair, drill, fault, n_stops, newest, connection, first, widest };
         Self(Arc::new((Mutex::new(bench), Condvar::new())), 0)
     }
 
@@ -161,6 +163,18 @@ impl Tap {
         self.0.0.lock().unwrap().newest.clone()
     }
 
+    /// Returns the widest commanded opening since the last call.
+    pub(crate) fn take_widest(&self) -> f64 {
+        std::mem::take(&mut self.0.0.lock().unwrap().widest)
+    }
+
+    /// The true openings of the grippers and heights of the blocks, metres, arm by arm.
+    pub(crate) fn held(&self) -> [(f64, f64); 2] {
+        let bench = self.0.0.lock().unwrap();
+        let objects = bench.pair.objects();
+        [0, 1].map(|arm| (bench.pair.opening(ArmIndex(arm)), objects[arm].at_m.z))
+    }
+
     /// The true joint angles.
     pub(crate) fn angles(&self) -> [Joints; 2] {
         let bench = self.0.0.lock().unwrap();
@@ -183,6 +197,10 @@ impl Driver for Tap {
             Fault::None | Fault::Hang => {
                 bench.first.get_or_insert_with(|| command.clone());
                 bench.newest = command.order.clone();
+                if let Order::Move(arms) = &command.order {
+                    let openings = arms.iter().map(|arm| arm.opening);
+                    bench.widest = openings.fold(bench.widest, f64::max);
+                }
                 let Bench { pair, drill, .. } = &mut *bench;
                 drill.apply(pair);
                 Ok(drill.delayed(pair.exchange(command)?))
@@ -217,6 +235,10 @@ pub(crate) fn patient() -> Settings {
     Settings { owner_hold_s: 1e6, owner_stop_s: 1e6, lease_s: 1e6, ..Settings::default() }
 }
 
+fn seeded() -> SimulatedConfig {
+    SimulatedConfig { seed: 1, ..SimulatedConfig::default() }
+}
+
 /// A running service.
 pub(crate) struct Rig {
     pub(crate) client: BridgeClient<Channel>,
@@ -240,27 +262,33 @@ impl Rig {
 
     /// A service that can reconnect to its arms.
     pub(crate) async fn dialling(settings: Settings) -> Self {
-        Self::start(settings, 1.0, |tap| {
+        Self::start(settings, 1.0, seeded(), |tap| {
             let tap = tap.clone();
             Some(Arc::new(move || tap.client_config().map(|tap| Box::new(tap) as BoxDriver)))
         })
         .await
     }
 
+    /// A service whose arms have a block each.
+    pub(crate) async fn with_blocks(settings: Settings, blocks: Vec<Block>) -> Self {
+        Self::start(settings, 1.0, SimulatedConfig { blocks, ..seeded() }, |_| None).await
+    }
+
     /// A service that plays nothing faster than `speed`.
     pub(crate) async fn bounded(settings: Settings, speed: f64) -> Self {
-        Self::start(settings, speed, |_| None).await
+        Self::start(settings, speed, seeded(), |_| None).await
     }
 
     async fn start(
         settings: Settings,
         speed: f64,
+        config: SimulatedConfig,
         reconnect: fn(&Tap) -> Option<Reconnect>,
     ) -> Self {
         let listener = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
         let address = listener.local_addr().unwrap();
         let injector = Injector::default();
-        let tap = Tap::new(1, injector.clone(), &settings);
+        let tap = Tap::new(config, injector.clone(), &settings);
         let clock = Arc::new(TestClock::default());
         let executor = Executor::new(mico_cell(), Box::new(tap.clone()) as _, settings).unwrap();
         let shutdown = CancellationToken::new();
