@@ -49,6 +49,20 @@ fn trials_are_evaluated_and_recorded() {
 }
 
 #[test]
+fn trials_before_a_failure_are_kept() {
+    let dir = tempfile::tempdir().expect("a directory");
+    std::fs::create_dir_all(dir.path().join("motions/student-push-classic-closed-loop-0003.json"))
+        .expect("created");
+    let args = ["--policy", STUDENT, "--mode", "closed-loop", "--trials", "8", "--motions"];
+    let output = trial(dir.path(), &args);
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(64), "{error}");
+    assert!(error.contains("has the first 3 trials") && error.contains("-0003.json"), "{error}");
+    let numbers: Vec<_> = rows(dir.path()).iter().map(|row| row["trial"].as_u64()).collect();
+    assert_eq!(numbers, [Some(0), Some(1), Some(2)]);
+}
+
+#[test]
 fn reports_know_every_cause_of_failure() {
     assert_eq!(tandem_report::trials::CAUSES, tandem_trials::trial::FailureCause::NAMES);
 }

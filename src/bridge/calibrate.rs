@@ -3,9 +3,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use anyhow::anyhow;
 use serde_json::json;
 use tandem_bridge::calibration::{CalibrationError, JointTiming, Operator, calibrate as measure};
-use tandem_bridge::cell_file::{ArmTiming, with_timings};
+use tandem_bridge::cell_file::{ArmTiming, CellFile, with_timings};
 use tandem_system::atomic_file;
 use tokio_util::sync::CancellationToken;
 
@@ -20,7 +21,6 @@ pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
     let Some(path) = args.arms.cell.clone() else {
         return Err(Failed::usage("--cell FILE is missing: write one with `tandem bridge cell`"));
     };
-    let text = cell::text(&path)?;
     let cell = Cell::load(Some(&path))?;
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     let names: Vec<String> = cell.file.arms.iter().map(|arm| arm.name.clone()).collect();
@@ -31,7 +31,7 @@ pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
             tokio::task::spawn_blocking(move || measure_arms(&args, &cell, &interrupted));
         measuring.await.or_exit(Exit::Bug, String::new)?
     })?;
-    save(&path, &text, &measured)?;
+    save(&path, &names, &measured)?;
     if json {
         let arm = |(name, timing): (&String, &ArmTiming)| {
             json!({
@@ -48,10 +48,21 @@ pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
     output::print(format_args!("written to {}", path.display()))
 }
 
-/// Writes the times into the cell file, which had this text.
-fn save(path: &Path, text: &str, measured: &[ArmTiming]) -> Result<(), Failed> {
-    let text = with_timings(text, measured);
-    let text = text.or_exit(Exit::Data, || format!("{path:?} is unchanged: measured"))?;
+/// Writes the times of the arms called `names` into the cell file, which may have been edited during the measurement.
+fn save(path: &Path, names: &[String], measured: &[ArmTiming]) -> Result<(), Failed> {
+    let is_unchanged = || {
+        let arms = names.iter().zip(measured);
+        let arms: Vec<_> =
+            arms.map(|(name, timing)| format!("{name}: {}", times(timing))).collect();
+        format!("{path:?} is unchanged; measured {}", arms.join("; "))
+    };
+    let text = cell::text(path).map_err(|failed| failed.context(is_unchanged()))?;
+    let present = CellFile::parse(&text).or_exit(Exit::Data, is_unchanged)?;
+    if !present.arms.iter().map(|arm| &arm.name).eq(names) {
+        let other = anyhow!("the file has been edited and has other arms");
+        return Err(Failed::new(Exit::Data, other).context(is_unchanged()));
+    }
+    let text = with_timings(&text, measured).or_exit(Exit::Data, is_unchanged)?;
     let written = atomic_file::replace(path, text.as_bytes());
     written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
@@ -95,4 +106,33 @@ fn measure_arms(
 fn times(timing: &ArmTiming) -> String {
     let [lag, reaction, brake] = [timing.lag_s, timing.reaction_s, timing.brake_s].map(|s| 1e3 * s);
     format!("lag {lag:.1} ms, reaction {reaction:.1} ms, brake {brake:.1} ms")
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_bridge::cell_file::DEFAULT_TEXT;
+
+    use super::*;
+
+    #[test]
+    fn edits_during_the_measurement_are_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("cell.toml");
+        let names: Vec<_> =
+            CellFile::parse(DEFAULT_TEXT).unwrap().arms.into_iter().map(|arm| arm.name).collect();
+        let measured =
+            [0.021, 0.022].map(|lag_s| ArmTiming { lag_s, reaction_s: 0.03, brake_s: 0.2 });
+
+        let edited = format!("{DEFAULT_TEXT}\n# The left base was measured again.\n");
+        std::fs::write(&path, &edited).unwrap();
+        save(&path, &names, &measured).unwrap();
+        let saved = std::fs::read_to_string(&path).unwrap();
+        assert!(saved.contains("measured again"), "{saved}");
+        assert!(saved.contains("lag_s = 0.021") && saved.contains("lag_s = 0.022"), "{saved}");
+
+        let exchanged: Vec<_> = names.iter().rev().cloned().collect();
+        let refused = save(&path, &exchanged, &measured).unwrap_err().line();
+        assert!(refused.contains("other arms") && refused.contains("lag 22.0 ms"), "{refused}");
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), saved);
+    }
 }

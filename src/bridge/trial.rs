@@ -1,11 +1,11 @@
 //! `tandem bridge trial`: runs policies on the simulated pair.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use clap::ValueEnum as _;
 use indicatif::ProgressBar;
-use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use serde_json::json;
 use tandem_core::text::counted;
 use tandem_core::{Layout, Task};
@@ -80,11 +80,14 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 time_limit_s: TIME_LIMIT_S,
             };
             let series = Series { policy, config };
-            let rows = run(&series, args, &out)?;
-            for row in &rows {
-                log.append(row).or_exit(Exit::TryAgain, String::new)?;
-            }
-            record(&series, &rows, &out)?;
+            let rows = run(&series, args, &out, &mut log).map_err(|(failed, n_rows)| {
+                match all.len() as u64 + n_rows {
+                    0 => failed,
+                    n_rows => {
+                        failed.context(format!("{} has the first {n_rows} trials", file.display()))
+                    }
+                }
+            })?;
             all.extend(rows);
         }
     }
@@ -196,12 +199,38 @@ fn block(edge_cm: Option<f32>, task: Task) -> Result<Block, Failed> {
     Ok(Block { half_m, mass_kg, ..Block::small([0.0; 2]) })
 }
 
-/// Runs the trials of `series` with a progress bar and writes their motions if `args` ask for them.
-fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow>, Failed> {
+/// Writes rows in the order of their numbers, each as soon as those before it are written.
+struct OrderedRows<'a> {
+    log: &'a mut TrialsLog,
+    n_written: u64,
+    waiting: BTreeMap<u64, TrialRow>,
+}
+
+impl OrderedRows<'_> {
+    fn add(&mut self, row: TrialRow) -> Result<(), Failed> {
+        self.waiting.insert(row.trial, row);
+        while let Some(row) = self.waiting.remove(&self.n_written) {
+            self.log.append(&row).map_err(Failed::of_write)?;
+            self.n_written += 1;
+        }
+        Ok(())
+    }
+}
+
+/// Runs the trials of `series` with a progress bar, writes their rows to `log`, and their motions and logs if `args` ask for
+/// them. An error comes with the number of rows that are written.
+fn run(
+    series: &Series<'_>,
+    args: &TrialArgs,
+    out: &Path,
+    log: &mut TrialsLog,
+) -> Result<Vec<TrialRow>, (Failed, u64)> {
     let label = format!("{}, {}", series.policy.name, series.config.mode.name());
     let bar = ProgressBar::new(args.trials).with_prefix(label);
     let style = indicatif::ProgressStyle::with_template("{prefix} {wide_bar} {pos} of {len}");
-    let bar = bar.with_style(style.or_exit(Exit::Bug, String::new)?);
+    let style = style.or_exit(Exit::Bug, String::new).map_err(|failed| (failed, 0))?;
+    let bar = bar.with_style(style);
+    let written = Mutex::new(OrderedRows { log, n_written: 0, waiting: BTreeMap::new() });
     let rows = series.run(args.trials, |report, row| {
         let name = format!("{}-{}-{:04}", row.policy, row.mode, row.trial);
         if args.motions {
@@ -217,12 +246,19 @@ fn run(series: &Series<'_>, args: &TrialArgs, out: &Path) -> Result<Vec<TrialRow
             RecordName::Failures => !row.success,
             RecordName::None => false,
         };
-        row.log = recorded.then(|| format!("{LOGS}/{name}.mcap"));
+        if recorded {
+            let log = row.log.insert(format!("{LOGS}/{name}.mcap")).clone();
+            create_directory(&out.join(LOGS)).map_err(SeriesFailed)?;
+            series.record(row, &out.join(log))?;
+        }
+        let mut written = written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.add(row.clone()).map_err(SeriesFailed)?;
         bar.inc(1);
         Ok(())
     });
     bar.finish_and_clear();
-    rows.map_err(|SeriesFailed(failed)| failed)
+    let n_written = written.into_inner().unwrap_or_else(PoisonError::into_inner).n_written;
+    rows.map_err(|SeriesFailed(failed)| (failed, n_written))
 }
 
 fn write_motion(report: &TrialReport, speed: f64, path: &Path) -> Result<(), Failed> {
@@ -230,18 +266,6 @@ fn write_motion(report: &TrialReport, speed: f64, path: &Path) -> Result<(), Fai
         return Ok(());
     }
     file::write(path, speed, &report.waypoints)
-}
-
-/// Writes the log of each row that names one.
-fn record(series: &Series<'_>, rows: &[TrialRow], out: &Path) -> Result<(), Failed> {
-    if rows.iter().any(|row| row.log.is_some()) {
-        create_directory(&out.join(LOGS))?;
-    }
-    let recorded = rows.par_iter().try_for_each(|row| match &row.log {
-        Some(name) => series.record(row, &out.join(name)).map_err(SeriesFailed::from),
-        None => Ok(()),
-    });
-    recorded.map_err(|SeriesFailed(failed)| failed)
 }
 
 fn create_directory(path: &Path) -> Result<(), Failed> {

@@ -1,6 +1,6 @@
 //! `tandem policy export` and `tandem policy import`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use tandem_core::rng::uniform;
@@ -31,6 +31,9 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
         let shown = args.file.display();
         return Err(Failed::usage(format!("--critic-onnx: {shown} has no critic")));
     }
+    let outputs =
+        [("--onnx", args.onnx.as_deref()), ("--critic-onnx", args.critic_onnx.as_deref())];
+    check_distinct(&[("FILE", Some(args.file.as_path())), outputs[0], outputs[1]])?;
     let mut written = Vec::new();
     let networks: [(_, _, Encode); 2] =
         [("actor", &args.onnx, write::actor), ("critic", &args.critic_onnx, write::critic)];
@@ -43,7 +46,7 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
         written.push((role, path, model.digest));
     }
     if args.json {
-        let file = |(role, path, digest): &(&str, &std::path::PathBuf, String)| json!({ "role": role, "file": path.to_string_lossy(), "digest": digest });
+        let file = |(role, path, digest): &(&str, &PathBuf, String)| json!({ "role": role, "file": path.to_string_lossy(), "digest": digest });
         let files: Vec<_> = written.iter().map(file).collect();
         return output::print(json!({ "policy_digest": policy.digest(), "files": files }));
     }
@@ -54,6 +57,11 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
 }
 
 pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
+    for (name, input) in
+        [("ACTOR", Some(args.actor.as_path())), ("--critic", args.critic.as_deref())]
+    {
+        check_distinct(&[(name, input), ("--out", Some(args.out.as_path()))])?;
+    }
     let actor = Model::load(&args.actor).or_exit(Exit::Data, String::new)?;
     let critic = args.critic.as_deref().map(Model::load).transpose();
     let critic = critic.or_exit(Exit::Data, String::new)?;
@@ -101,6 +109,33 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
         "compared      {N_COMPARED} random states: actions differ by {:.1e}{values}",
         differences[0]
     ))
+}
+
+/// Rejects two arguments that name one file: writing one would destroy the other.
+fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Failed> {
+    let mut former: Vec<(&str, PathBuf)> = Vec::new();
+    for (name, path) in files {
+        let Some(path) = path else { continue };
+        let file = resolved(path);
+        if let Some((other, _)) = former.iter().find(|(_, other)| *other == file) {
+            let shown = path.display();
+            return Err(Failed::usage(format!(
+                "{name} {shown}: {other} is the same file; choose another"
+            )));
+        }
+        former.push((name, file));
+    }
+    Ok(())
+}
+
+/// Returns the path without links and `..`, as far as it exists.
+fn resolved(path: &Path) -> PathBuf {
+    let in_directory = || {
+        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new(".")).canonicalize().ok()?;
+        Some(parent.join(path.file_name()?))
+    };
+    path.canonicalize().ok().or_else(in_directory).unwrap_or_else(|| path.to_owned())
 }
 
 fn refused(path: &Path, source: ModelError) -> Failed {

@@ -1,7 +1,7 @@
 //! Results of trials on arms: `trials.jsonl`, one JSON object per trial.
 
 use std::fs::File;
-use std::io::{BufRead as _, BufReader, Write as _};
+use std::io::{BufRead as _, BufReader, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -87,7 +87,8 @@ pub struct ToolPathPoint {
 pub struct TrialsLog {
     path: PathBuf,
     file: File,
-    is_empty: bool,
+    /// Size of the trials appended so far, bytes.
+    n_bytes: u64,
 }
 
 impl TrialsLog {
@@ -98,22 +99,29 @@ impl TrialsLog {
     pub fn create(path: &Path) -> Result<Self, Error> {
         let file = File::options().write(true).create(true).truncate(false).open(path);
         let file = file.map_err(Error::io("create", path))?;
-        Ok(Self { path: path.to_owned(), file, is_empty: true })
+        Ok(Self { path: path.to_owned(), file, n_bytes: 0 })
     }
 
     /// Appends a trial.
     ///
     /// # Errors
-    /// If the file cannot be written.
+    /// If the file cannot be written. It then ends with the trial before.
     pub fn append(&mut self, row: &TrialRow) -> Result<(), Error> {
         let write_error = |source| Error::io("append to", &self.path)(source);
         let mut line =
             serde_json::to_vec(row).map_err(std::io::Error::other).map_err(write_error)?;
         line.push(b'\n');
-        if std::mem::take(&mut self.is_empty) {
+        if self.n_bytes == 0 {
             self.file.set_len(0).map_err(write_error)?;
         }
-        self.file.write_all(&line).map_err(write_error)
+        if let Err(error) = self.file.write_all(&line) {
+            // A part of the line may have been written.
+            self.file.set_len(self.n_bytes).ok();
+            self.file.seek(SeekFrom::Start(self.n_bytes)).ok();
+            return Err(write_error(error));
+        }
+        self.n_bytes += line.len() as u64;
+        Ok(())
     }
 }
 

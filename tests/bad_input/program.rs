@@ -94,7 +94,8 @@ fn prepare(directory: &Path) {
     let whole = fs::read(shipped("teacher-push")).expect("ships");
     let mut altered = whole.clone();
     *altered.last_mut().expect("not empty") ^= 1;
-    let files: [(&str, &[u8]); 9] = [
+    let files: [(&str, &[u8]); 10] = [
+        ("whole", &whole),
         ("empty", b""),
         ("garbage", &[0x8f; 3000]),
         ("torn", &whole[..1000]),
@@ -117,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 97] = [
+const CASES: [(&str, i32, &str); 99] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -151,6 +152,12 @@ const CASES: [(&str, i32, &str); 97] = [
     ("train --out @empty", 64, "it is a file"),
     ("train --resume --out @empty", 64, "it is a file"),
     ("eval", 64, "--policy"),
+    ("policy export @whole --onnx @whole", 64, "FILE is the same file"),
+    (
+        "policy export @whole --onnx @a.onnx --critic-onnx @folder/../a.onnx",
+        64,
+        "--onnx is the same file",
+    ),
     ("eval --policy @missing", 65, "missing"),
     ("eval --policy @folder", 65, "folder"),
     ("eval --policy @empty", 65, "empty"),

@@ -1,8 +1,10 @@
 //! A series of trials: one policy in one mode, in parallel, with a row for each trial and a log where one is wanted.
 
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
-use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use tandem_kinematics::Joints;
 use tandem_policy::{Actor, Policy};
 use tandem_sim::SimError;
@@ -58,27 +60,44 @@ pub enum SeriesError {
 }
 
 impl Series<'_> {
-    /// Runs trials `0..n_trials` on all threads of the pool. Calls `done` after each trial, on the trial's thread, with
-    /// the trial's report and its row without a log. Returns the rows by number.
+    /// Runs trials `0..n_trials` on all threads of the pool, which begin them in order. Calls `done` after each trial, on
+    /// the trial's thread, with the trial's report and its row without a log. Returns the rows by number.
     ///
     /// # Errors
-    /// Returns the error of a trial or of `done`; if there are several, which one depends on the threads. Other trials may
-    /// then not be carried out.
+    /// Returns the error of a trial or of `done`; if there are several, that of the first trial. No other trial begins
+    /// then. Those that have begun are completed, so `done` has been called for every trial before the first that failed.
     pub fn run<E: From<SeriesError> + Send>(
         &self,
         n_trials: u64,
         done: impl Fn(&TrialReport, &mut TrialRow) -> Result<(), E> + Sync,
     ) -> Result<Vec<TrialRow>, E> {
         let actor = self.policy.policy.actor().map_err(SeriesError::from)?;
-        let trial = |(runner, actor): &mut (Result<TrialRunner, SimError>, Actor), number| {
+        let trial = |runner: &mut Result<TrialRunner, SimError>, actor: &mut Actor, number| {
             let runner = runner.as_mut().map_err(|error| SeriesError::World(error.clone()))?;
             let report = attempt(runner, actor, number, &mut NoObserver)?;
             let mut row = self.row(&report);
             done(&report, &mut row)?;
             Ok(row)
         };
-        let prepare = || (TrialRunner::new(self.config.clone()), actor.clone());
-        (0..n_trials).into_par_iter().map_init(prepare, trial).collect()
+        let (next, has_failed) = (AtomicU64::new(0), AtomicBool::new(false));
+        let outcomes = Mutex::new(BTreeMap::<u64, Result<TrialRow, E>>::new());
+        rayon::broadcast(|_thread| {
+            let (mut runner, mut actor) = (None, actor.clone());
+            while !has_failed.load(Ordering::Relaxed) {
+                let number = next.fetch_add(1, Ordering::Relaxed);
+                if number >= n_trials {
+                    break;
+                }
+                let runner = runner.get_or_insert_with(|| TrialRunner::new(self.config.clone()));
+                let outcome = trial(runner, &mut actor, number);
+                if outcome.is_err() {
+                    has_failed.store(true, Ordering::Relaxed);
+                }
+                outcomes.lock().unwrap_or_else(PoisonError::into_inner).insert(number, outcome);
+            }
+        });
+        let outcomes = outcomes.into_inner().unwrap_or_else(PoisonError::into_inner);
+        outcomes.into_values().collect()
     }
 
     /// Repeats the trial of `row`, which takes the same course, and writes it to the MCAP file `path`.
