@@ -171,14 +171,10 @@ pub(crate) fn has_default_interval(config: &RunConfig) -> bool {
     config.evaluation.every_env_steps == default
 }
 
-/// Keeps the interval between evaluations of the run that `run_file` describes, if there is one and that of `config` only
-/// follows from recipe and length: a run that is made longer keeps the interval that it started with.
-pub(crate) fn keep_interval(config: &mut RunConfig, run_file: &Path) {
-    if !run_file.exists() || !has_default_interval(config) {
-        return;
-    }
-    // A run file that cannot be read is reported when the run is resumed.
-    if let Ok(existing) = resolve(Some(run_file), &[]) {
+/// Gives `config` the interval between evaluations of the `existing` run that it resumes, unless `config` sets its own: a
+/// run that is made longer keeps the interval that it started with.
+pub(crate) fn keep_interval(config: &mut RunConfig, existing: &RunConfig) {
+    if has_default_interval(config) {
         config.evaluation.every_env_steps = existing.evaluation.every_env_steps;
     }
 }

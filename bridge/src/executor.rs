@@ -60,7 +60,7 @@ pub struct Executor<D: Driver> {
     envelope: Envelope,
     state: ArmsState,
     commands: CommandHistory,
-    /// The newest cause after the one for which the arms were stopped.
+    /// The newest cause of a stop after the one that stopped the arms.
     later_stop: Option<Stop>,
     ticked_s: Option<f64>,
     /// The error of the last attempt to stop the drives, until a command gets through.
@@ -298,7 +298,7 @@ impl<D: Driver> Executor<D> {
         self.state.stop()
     }
 
-    /// The newest cause for which the arms would be stopped if they were not, while they are stopped.
+    /// The newest cause of a stop while the arms are stopped: the one that stopped them, or a later one that would have.
     #[must_use]
     pub fn newest_stop(&self) -> Option<&Stop> {
         self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))
@@ -436,7 +436,7 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Stops the arms in the fastest way. The first cause is kept, and the newest one beside it.
+    /// Stops the arms in the fastest way. Keeps the first cause and the newest one.
     fn halt(&mut self, breach: Breach, now_s: f64) {
         let stop = breach.at(now_s);
         if matches!(self.state, ArmsState::Stopped(_)) {

@@ -311,7 +311,8 @@ impl AdviceAccount {
     fn reopen(&mut self, spent: u64, n_losses: &mut u32) -> Result<(), TeacherError> {
         loop {
             if *n_losses > 0 {
-                self.pause(BACKOFF.pause_after(*n_losses))?;
+                let pause = BACKOFF.pause_after(*n_losses);
+                self.unless_stopped(async move { tokio::time::sleep(pause).await })?;
             }
             *n_losses = n_losses.saturating_add(1);
             self.open_or_reopen(spent)?;
@@ -320,18 +321,6 @@ impl AdviceAccount {
                 renewed => return renewed,
             }
         }
-    }
-
-    /// Waits for `duration`.
-    fn pause(&self, duration: Duration) -> Result<(), TeacherError> {
-        let shutdown = self.shutdown.clone();
-        let pause = async move {
-            tokio::select! {
-                () = tokio::time::sleep(duration) => Ok(()),
-                () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
-            }
-        };
-        self.runtime.wait_on(pause).unwrap_or(Err(TeacherError::Stopped))
     }
 
     /// Continues with the account. If it has more units left than the run may spend, because the ledger was restored to
@@ -442,18 +431,28 @@ impl AdviceAccount {
         T: Send + 'static,
         F: Future<Output = Result<tonic::Response<T>, Status>> + Send,
     {
-        let (client, shutdown) = (self.client.clone(), self.shutdown.clone());
-        let call = async move {
+        let client = self.client.clone();
+        let answered = async move {
             let operation = Operation { peer: "teacher", purpose: what };
-            let answered =
-                retry(BACKOFF, CALL_DEADLINE, operation, move || request(client.clone()));
+            retry(BACKOFF, CALL_DEADLINE, operation, move || request(client.clone())).await
+        };
+        let answer = self.unless_stopped(answered)?;
+        answer.map(tonic::Response::into_inner).map_err(|status| TeacherError::of(what, &status))
+    }
+
+    /// Waits for `work`, unless the run is stopped first.
+    fn unless_stopped<T: Send + 'static>(
+        &self,
+        work: impl Future<Output = T> + Send + 'static,
+    ) -> Result<T, TeacherError> {
+        let shutdown = self.shutdown.clone();
+        let work = async move {
             tokio::select! {
-                answer = answered => answer.map_err(|status| TeacherError::of(what, &status)),
+                done = work => Ok(done),
                 () = shutdown.cancelled_owned() => Err(TeacherError::Stopped),
             }
         };
-        let answer = self.runtime.wait_on(call).unwrap_or(Err(TeacherError::Stopped));
-        answer.map(tonic::Response::into_inner)
+        self.runtime.wait_on(work).unwrap_or(Err(TeacherError::Stopped))
     }
 }
 

@@ -25,8 +25,11 @@ use crate::{
 
 pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     let mut run_config = run_file::resolve(Some(&args.run), &[])?;
-    if args.resume || args.start_or_resume {
-        run_file::keep_interval(&mut run_config, &args.out.join("run.toml"));
+    // A run file that is missing or cannot be read is reported when the run starts.
+    if (args.resume || args.start_or_resume)
+        && let Ok(existing) = run_file::resolve(Some(&args.out.join("run.toml")), &[])
+    {
+        run_file::keep_interval(&mut run_config, &existing);
     }
     let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
     let own = metrics::of_process("learner");

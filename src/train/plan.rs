@@ -233,17 +233,16 @@ fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Fa
     let settings = [served_settings(args, served)?, settings_of(args)?].concat();
     let mut config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
-    // A resumed run keeps the name in its own run file, even if --run names another one.
-    match own_file.filter(|_| args.run.is_some() && !is_named) {
-        Some(own_file) => {
-            run_file::keep_interval(&mut config, &own_file);
-            match run_file::resolve(Some(&own_file), &[]) {
-                Ok(RunConfig { name, .. }) => Ok(RunConfig { name, ..config }),
-                Err(_) => Ok(config),
-            }
+    // A resumed run keeps its name and its interval between evaluations, even if --run names another run file.
+    if let Some(own_file) = own_file.filter(|_| args.run.is_some())
+        && let Ok(existing) = run_file::resolve(Some(&own_file), &[])
+    {
+        run_file::keep_interval(&mut config, &existing);
+        if !is_named {
+            config.name = existing.name;
         }
-        None => Ok(config),
     }
+    Ok(config)
 }
 
 /// Returns the settings that describe the task of a server, unless the task is built-in or the command line names a task

@@ -70,7 +70,7 @@ fn the_simulated_pair_has_the_times_it_was_configured_with() {
     }
 }
 
-/// Arms that record what they are told, and may report faults in a single state.
+/// Arms that record their commands and can report faults in a single state.
 struct Watched {
     pair: SimulatedPair,
     told: Arc<Mutex<Told>>,
