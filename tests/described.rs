@@ -265,6 +265,36 @@ fn an_evaluation_on_a_server_gives_the_results_of_the_run() {
 }
 
 #[test]
+fn a_teacher_goes_to_onnx_and_back_and_advises_in_either_form() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (one, two) = (ReachServer::start(one_arm()), ReachServer::start(two_arms()));
+    let [actor, critic, back] =
+        ["actor.onnx", "critic.onnx", "back.safetensors"].map(|name| keep.path().join(name));
+    let trained = TRAINED.teacher_path();
+    let export = ["policy", "export", text(&trained), "--onnx", text(&actor), "--critic-onnx"];
+    assert!(run(&[&export[..], &[text(&critic)]].concat()).status.success());
+    let shown = json(&run(&["policy", "show", text(&actor), "--json"]));
+    assert_eq!((&shown["task"], &shown["arms"]), (&"lab/reach".into(), &1.into()));
+
+    let import = |more: &[&str]| {
+        let args = ["policy", "import", text(&actor), "--out", text(&back), "--json"];
+        run(&[&args[..], &["--critic", text(&critic)], more].concat())
+    };
+    for server in [&[][..], &["--env", &one.address]] {
+        assert_eq!(json(&import(server))["digest"], TRAINED.teacher["policy_digest"]);
+        let composed = ["eval", "--composed-teachers", text(&back), "--env", &two.address];
+        let evaluated = json(&run(&[&composed[..], &["--episodes", "4", "--json"]].concat()));
+        assert_eq!(evaluated["arms"], 2);
+    }
+    check_refused(&import(&["--env", &two.address]), 65, "lab/reach with 2 arms has");
+
+    let mut args = advised(&two, &actor, keep.path());
+    args.extend(["--teacher-critic", text(&critic)]);
+    let student = json(&run(&args));
+    assert_eq!(student["advice_spent"], TRAINED.student["advice_spent"], "{student}");
+}
+
+#[test]
 fn a_sweep_trains_runs_of_the_task_of_its_server() {
     let keep = tempfile::tempdir().expect("a directory");
     let (server, out) = (ReachServer::start(one_arm()), keep.path().join("sweep"));

@@ -78,6 +78,20 @@ fn a_policy_comes_back_from_onnx_as_it_went() {
 }
 
 #[test]
+fn a_network_from_elsewhere_takes_the_task_of_a_server() {
+    let files = Files::new();
+    let import = |more: &[&str]| {
+        let out = files.name("policy.safetensors");
+        let args = ["policy", "import", "onnx/tests/pytorch/sb3-actor.dynamo.onnx", "--out", &out];
+        json(&[&args[..], &["--json"], more].concat())
+    };
+    assert_eq!(import(&[])["task"], "push");
+    let program = env!("CARGO_BIN_EXE_tandem");
+    let server = format!("exec '{program}' env --task push --arms 1");
+    assert_eq!(import(&["--env-command", &server])["task"], "shared-push");
+}
+
+#[test]
 fn what_cannot_be_converted_is_refused_in_one_line() {
     let files = Files::new();
     let [actor, critic] = files.export();

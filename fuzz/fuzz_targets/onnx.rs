@@ -10,7 +10,7 @@ fuzz_target!(|file: &[u8]| {
     let Ok(model) = with_bounded_memory(|| Model::decode(file)) else { return };
     for role in [Role::Actor, Role::Critic] {
         let Ok(layout) = layout_of(&model, role) else { continue };
-        let Ok(mut network) = BoundNetwork::new(&model, role, layout) else { continue };
+        let Ok(mut network) = BoundNetwork::new(&model, role, &layout) else { continue };
         let (observation, goal) = (vec![0.5; layout.n_observation()], vec![-0.5; layout.n_goal()]);
         let mut output = vec![f32::NAN; model.network.n_output];
         network.run(&observation, &goal, &vec![0.25; layout.n_action()], &mut output);

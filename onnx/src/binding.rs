@@ -1,10 +1,11 @@
 //! Networks bound to the vectors of a layout.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::ops::Range;
 
 use tandem_core::text::counted;
-use tandem_core::{Layout, Task, TaskSpec};
+use tandem_core::{Layout, Task, TaskDescription, TaskSpec};
 
 use crate::error::ModelError;
 use crate::metadata;
@@ -133,11 +134,11 @@ impl BoundNetwork {
     }
 }
 
-/// Returns the layout of `model`: the one in its metadata, or the only one whose vectors fit.
+/// Returns the layout of `model`: the one in its metadata, or the only one of the classic world whose vectors fit.
 ///
 /// # Errors
 /// When no layout fits, or several do.
-pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
+pub fn layout_of(model: &Model, role: Role) -> Result<TaskSpec, ModelError> {
     if let Some(layout) = layout_in_metadata(&model.metadata)? {
         return Ok(layout);
     }
@@ -147,7 +148,7 @@ pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
     let fitting = candidates.filter(|layout| BoundNetwork::new(model, role, *layout).is_ok());
     let fitting: Vec<Layout> = fitting.collect();
     match fitting.as_slice() {
-        [layout] => Ok(*layout),
+        [layout] => Ok((*layout).into()),
         // The error for one arm names the first input or output that does not fit.
         [] => match BoundNetwork::new(model, role, Layout::new(Task::Push, 1)) {
             Err(error) => Err(error),
@@ -161,20 +162,29 @@ pub fn layout_of(model: &Model, role: Role) -> Result<Layout, ModelError> {
     }
 }
 
-fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<Layout>, ModelError> {
-    let (Some(task), Some(n_arms)) = (entries.get(metadata::TASK), entries.get(metadata::N_ARMS))
-    else {
-        return Ok(None);
-    };
+fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<TaskSpec>, ModelError> {
     let refused = |key: &str, value: &str, expected: String| {
         let value = tandem_core::text::shortened(value, 80);
         ModelError::Model(format!("metadata {key:?} is {value:?}, expected {expected}"))
+    };
+    if let Some(text) = entries.get(metadata::TASK_DESCRIPTION) {
+        let problem = |problem: &dyn Display| {
+            let expected = format!("the description of a task: {problem}");
+            refused(metadata::TASK_DESCRIPTION, text, expected)
+        };
+        let description: TaskDescription =
+            serde_json::from_str(text).map_err(|error| problem(&error))?;
+        return TaskSpec::new(description).map(Some).map_err(|error| problem(&error));
+    }
+    let (Some(task), Some(n_arms)) = (entries.get(metadata::TASK), entries.get(metadata::N_ARMS))
+    else {
+        return Ok(None);
     };
     let task = task.parse::<Task>().map_err(|_unknown| {
         refused(metadata::TASK, task, format!("one of {}", Task::ALL.map(Task::name).join(", ")))
     })?;
     match n_arms.parse::<usize>() {
-        Ok(n @ 1..=MAX_ARMS) => Ok(Some(Layout::new(task, n))),
+        Ok(n @ 1..=MAX_ARMS) => Ok(Some(Layout::new(task, n).into())),
         _ => Err(refused(metadata::N_ARMS, n_arms, format!("1 to {MAX_ARMS}"))),
     }
 }

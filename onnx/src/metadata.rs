@@ -13,6 +13,9 @@ use tandem_policy::Policy;
 pub const TASK: &str = "task";
 /// Number of arms.
 pub const N_ARMS: &str = "n_arms";
+/// Description of the task as JSON, if the task is not built-in: the fields of
+/// [`TaskDescription`](tandem_core::TaskDescription).
+pub const TASK_DESCRIPTION: &str = "task_description";
 /// Digest of the policy that was exported; see `docs/policy-format.md`.
 pub const POLICY_DIGEST: &str = "policy_digest";
 /// Start of the keys of the policy's own metadata.
@@ -49,7 +52,10 @@ pub fn of(policy: &Policy) -> BTreeMap<String, String> {
         (POLICY_DIGEST, policy.digest()),
         ("value", value_text(policy.n_heads)),
     ]);
-    entries.extend(task.as_built_in().into_iter().flat_map(of_vectors));
+    match task.as_built_in() {
+        Some(layout) => entries.extend(of_vectors(layout)),
+        None => drop(entries.insert(TASK_DESCRIPTION, json!(task.description()).to_string())),
+    }
     let mut entries: BTreeMap<String, String> =
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
     entries.extend(success(&policy.metadata));

@@ -15,7 +15,7 @@ fn is_usable(file: &[u8]) -> bool {
     let Ok(model) = Model::decode(file) else { return false };
     for role in [Role::Actor, Role::Critic] {
         let Ok(layout) = layout_of(&model, role) else { continue };
-        let Ok(mut network) = BoundNetwork::new(&model, role, layout) else { continue };
+        let Ok(mut network) = BoundNetwork::new(&model, role, &layout) else { continue };
         let (observation, goal) = (vec![0.5; layout.n_observation()], vec![-0.5; layout.n_goal()]);
         let mut output = vec![0.0; model.network.n_output];
         network.run(&observation, &goal, &vec![0.25; layout.n_action()], &mut output);

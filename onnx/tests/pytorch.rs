@@ -54,7 +54,7 @@ fn exported_actors_act_as_in_pytorch() {
             let model = model(name, exporter);
             assert_eq!(
                 layout_of(&model, Role::Actor).expect("as exported"),
-                LAYOUT,
+                LAYOUT.into(),
                 "{name}, {exporter}"
             );
             let mut actor = BoundNetwork::new(&model, Role::Actor, LAYOUT).expect("as exported");

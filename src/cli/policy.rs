@@ -70,6 +70,8 @@ pub(crate) struct ExportArgs {
 Examples:
   tandem policy import actor.onnx --critic critic.onnx --out FILE.safetensors
   tandem policy import actor.onnx --task push --arms 1 --out FILE.safetensors
+  tandem policy import actor.onnx --env-command 'python3 server.py' \
+      --out FILE.safetensors
   tandem eval --composed-teachers FILE.safetensors
 
 A policy file has ReLU between the layers and tanh after the actor's last. `tandem teacher --policy \
@@ -89,6 +91,12 @@ pub(crate) struct ImportArgs {
     /// Number of arms [default: as for --task].
     #[arg(long, value_name = "N", requires = "task", value_parser = clap::value_parser!(u8).range(1..=8))]
     pub(crate) arms: Option<u8>,
+    /// The task is that of the server of environments at this address.
+    #[arg(long, value_name = "ADDR", conflicts_with = "task")]
+    pub(crate) env: Option<String>,
+    /// The task is that of the server of environments that this shell command starts.
+    #[arg(long, value_name = "CMD", conflicts_with_all = ["env", "task"])]
+    pub(crate) env_command: Option<String>,
     /// Output file.
     #[arg(long, value_name = "FILE.safetensors")]
     pub(crate) out: PathBuf,

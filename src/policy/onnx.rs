@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 use tandem_core::rng::uniform;
 use tandem_core::task::Norm;
-use tandem_core::{Layout, Stream, episode_rng};
+use tandem_core::{Layout, Stream, TaskSpec, episode_rng};
 use tandem_onnx::binding::layout_of;
 use tandem_onnx::{
     BoundNetwork, Error, Model, ModelError, Role, export as write, import as convert,
@@ -13,9 +13,9 @@ use tandem_onnx::{
 use tandem_policy::Policy;
 use tandem_system::atomic_file;
 
-use crate::cli::{ExportArgs, ImportArgs};
+use crate::cli::{EnvironmentArgs, ExportArgs, ImportArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{output, policy_file};
+use crate::{output, policy_file, served_task};
 
 /// Number of random states on which an imported policy is compared with its models.
 const N_COMPARED: usize = 1000;
@@ -66,18 +66,22 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     let critic = args.critic.as_deref().map(Model::load).transpose();
     let critic = critic.or_exit(Exit::Data, String::new)?;
     let refused = |source| refused(&args.actor, source);
-    let layout = match (args.task, args.arms) {
-        (Some(task), Some(n_arms)) => {
-            Layout::new(task.in_named_world(args.world)?, usize::from(n_arms))
+    let layout = match (args.task, args.arms, served_task(args)?) {
+        (Some(task), Some(n_arms), _) => {
+            Layout::new(task.in_named_world(args.world)?, usize::from(n_arms)).into()
         }
-        _ => layout_of(&actor, Role::Actor).map_err(refused)?,
+        (.., Some(task)) => task,
+        _ => layout_of(&actor, Role::Actor).map_err(|source| {
+            let remedy = "the task is unknown, name it with --task, --env or --env-command";
+            refused(source).context(remedy.to_owned())
+        })?,
     };
     // The critic alone is bound first, so that an error names its file.
     if let Some((critic, path)) = critic.as_ref().zip(args.critic.as_ref()) {
-        let bound = BoundNetwork::new(critic, Role::Critic, layout);
+        let bound = BoundNetwork::new(critic, Role::Critic, &layout);
         bound.map_err(|source| self::refused(path, source))?;
     }
-    let policy = convert(&actor, critic.as_ref(), layout).map_err(refused)?;
+    let policy = convert(&actor, critic.as_ref(), &layout).map_err(refused)?;
     let differences = compare(&policy, &actor, critic.as_ref()).map_err(refused)?;
     if differences.iter().any(|difference| difference.is_nan() || *difference > TOLERANCE) {
         return Err(Failed::new(
@@ -92,11 +96,11 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     policy.save(&args.out).or_cannot_write(String::new)?;
     if args.json {
         return output::print(json!({
-            "file": args.out.to_string_lossy(), "task": layout.task.name(), "arms": layout.n_arms, "digest": policy.digest(),
+            "file": args.out.to_string_lossy(), "task": layout.name(), "arms": layout.n_arms(), "digest": policy.digest(),
             "has_critic": policy.has_critic(), "action_difference": differences[0], "value_difference": differences[1],
         }));
     }
-    let (task, n_arms) = (layout.task, layout.n_arms);
+    let (task, n_arms) = (layout.name(), layout.n_arms());
     output::print(format_args!("policy        {}", args.out.display()))?;
     output::print(format_args!("task          {task}, arms {n_arms}"))?;
     output::print(format_args!("digest        {}", policy.digest()))?;
@@ -109,6 +113,16 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
         "compared      {N_COMPARED} random states: actions differ by {:.1e}{values}",
         differences[0]
     ))
+}
+
+/// Asks the server of environments that the arguments name, if they name one, for its task.
+fn served_task(args: &ImportArgs) -> Result<Option<TaskSpec>, Failed> {
+    let server = EnvironmentArgs {
+        env: args.env.clone(),
+        env_command: args.env_command.clone(),
+        ..EnvironmentArgs::default()
+    };
+    Ok(served_task::of_server(&server)?.map(|served| served.task))
 }
 
 /// Rejects two arguments that name one file: writing one would destroy the other.

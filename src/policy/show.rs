@@ -48,15 +48,15 @@ fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
     let fit =
         [(Role::Actor, "actor"), (Role::Critic, "critic")].into_iter().find_map(|(role, name)| {
             let layout = layout_of(&model, role).ok()?;
-            BoundNetwork::new(&model, role, layout).is_ok().then_some((name, layout))
+            BoundNetwork::new(&model, role, &layout).is_ok().then_some((name, layout))
         });
     if as_json {
         let inputs: Vec<_> =
             inputs.map(|input| json!({ "name": input.name, "width": input.width })).collect();
         return output::print(json!({
-            "role": fit.map(|(name, _)| name),
-            "task": fit.map(|(_, layout)| layout.task.name()),
-            "arms": fit.map(|(_, layout)| layout.n_arms),
+            "role": fit.as_ref().map(|(name, _)| name),
+            "task": fit.as_ref().map(|(_, layout)| layout.name()),
+            "arms": fit.as_ref().map(|(_, layout)| layout.n_arms()),
             "inputs": inputs,
             "output": { "name": network.output, "width": network.n_output },
             "layers": layers(network),
@@ -67,7 +67,7 @@ fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
     }
     match fit {
         Some((name, layout)) => {
-            let (task, n_arms) = (layout.task, layout.n_arms);
+            let (task, n_arms) = (layout.name(), layout.n_arms());
             line("fits", format_args!("{name} for {task}, arms {n_arms}"))?;
         }
         None => line("fits", "no task")?,

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use serde_json::json;
 use tandem_core::rng::uniform;
-use tandem_core::{Layout, Stream, Task, episode_rng};
+use tandem_core::{Layout, Stream, Task, TaskDescription, episode_rng};
 
 use super::*;
 use crate::export;
@@ -27,16 +28,38 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
         let policy = shipped(name);
         let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
         let critic = Model::decode(&export::critic(&policy).unwrap()).unwrap();
-        assert_eq!(
-            crate::binding::layout_of(&actor, Role::Actor).unwrap(),
-            policy.layout.as_built_in().unwrap()
-        );
+        assert_eq!(crate::binding::layout_of(&actor, Role::Actor).unwrap(), policy.layout);
         let imported = import(&actor, Some(&critic), &policy.layout).unwrap();
         assert_eq!(imported.digest(), policy.digest(), "{name}");
         let kept =
             policy.metadata.iter().all(|(key, value)| imported.metadata.get(key) == Some(value));
         assert!(kept, "{name}: the metadata is restored");
         assert_eq!(imported.metadata["imported_critic"], critic.digest);
+    }
+}
+
+#[test]
+fn a_model_of_a_task_that_is_not_built_in_describes_it() {
+    let mut policy = shipped("teacher-push-classic");
+    let description =
+        TaskDescription { name: "lab/reach".to_owned(), tolerance: 0.1, ..LAYOUT.description() };
+    policy.layout = TaskSpec::new(description).unwrap();
+    let mut actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
+    let layout = |actor: &Model| crate::binding::layout_of(actor, Role::Actor);
+    assert_eq!(layout(&actor).unwrap(), policy.layout);
+    assert!(!actor.metadata.contains_key("control_step_s"), "unknown of another task");
+
+    let built_in = Model::decode(&export::actor(&shipped("teacher-push-classic")).unwrap());
+    assert!(!built_in.unwrap().metadata.contains_key(metadata::TASK_DESCRIPTION));
+
+    for (text, problem) in [
+        ("{}", "missing field"),
+        (&json!(policy.layout.description()).to_string().replace("0.1", "-1.0"), "tolerance"),
+    ] {
+        actor.metadata.insert(metadata::TASK_DESCRIPTION.to_owned(), text.to_owned());
+        let message = layout(&actor).unwrap_err().to_string();
+        assert!(message.contains("expected the description of a task: "), "{message}");
+        assert!(message.contains(problem), "{message}");
     }
 }
 

@@ -29,7 +29,7 @@ impl OnnxPolicy {
     pub fn load(actor: &Path, critic: Option<&Path>) -> Result<Self, Error> {
         let model = Model::load(actor)?;
         let layout = layout_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;
-        let bound = BoundNetwork::new(&model, Role::Actor, layout);
+        let bound = BoundNetwork::new(&model, Role::Actor, &layout);
         let bound = bound.map_err(|source| refused(actor, source))?;
         let Some(path) = critic else {
             let values = 0;
