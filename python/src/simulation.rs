@@ -1,7 +1,7 @@
 //! One environment, and the reward.
 
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods as _, PyReadonlyArray2};
-use pyo3::exceptions::PyRuntimeError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -223,7 +223,26 @@ fn action_of(action: &Bound<'_, PyAny>, n_action: usize) -> PyResult<Vec<f32>> {
         let shape = action.getattr(intern!(py, "shape"))?;
         return Err(value_error(format!("the action has shape {shape}, expected ({n_action},)")));
     }
-    action.extract()
+    action.extract().map_err(|error| shape_error(action, n_action).unwrap_or(error))
+}
+
+/// Returns the error of an action that is a number or a nested sequence, `None` for one that fails otherwise.
+fn shape_error(action: &Bound<'_, PyAny>, n_action: usize) -> Option<PyErr> {
+    let py = action.py();
+    let shape = match py.import("numpy").and_then(|numpy| numpy.call_method1("shape", (action,))) {
+        Ok(shape) => shape,
+        Err(error) if error.is_instance_of::<PyValueError>(py) => {
+            let problem = "the action has rows of different lengths";
+            return Some(value_error(format!("{problem}, expected shape ({n_action},)")));
+        }
+        Err(_) => return None,
+    };
+    // NumPy gives objects that are not numbers, such as None, the shape () as well.
+    let has_shape = match shape.len().ok()? {
+        0 => action.extract::<f32>().is_ok(),
+        n_dimensions => n_dimensions > 1,
+    };
+    has_shape.then(|| value_error(format!("the action has shape {shape}, expected ({n_action},)")))
 }
 
 /// Returns the sparse rewards, shape `[n]`, of `achieved` and `desired` goals, both of shape `[n, n_goal]`.

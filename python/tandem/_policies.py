@@ -77,7 +77,7 @@ class _Policy:
     def _rows(self, name: str, function: Callable[..., ArrayLike], shape: tuple[int, ...], *inputs: Floats) -> Floats:
         """Applies `function` to all rows; to one at a time if its rows could depend on each other."""
         n_rows = len(inputs[0])
-        size = n_rows if self._is_batched else 1
+        size = max(n_rows, 1) if self._is_batched else 1
         parts = []
         for start in range(0, n_rows, size):
             rows = [array[start : start + size] for array in inputs]

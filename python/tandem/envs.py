@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, cast
+import operator
+from typing import Any, SupportsIndex, cast
 
 import gymnasium
 import numpy as np
@@ -101,27 +102,27 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         Args:
             seed: Starts the sequence of episodes of this seed, in [0, 2**64). Without a seed the sequence continues;
                 the first reset draws a seed from the operating system's entropy.
-            options: `{"episode": k}` starts episode `k` of the sequence.
+            options: `{"episode": k}` starts episode `k` of the sequence, in [0, 2**64).
 
         Returns:
             Observation and info.
 
         Raises:
-            ValueError: The seed, an option or the number of the episode is out of range; nothing has changed.
+            ValueError: The seed or an option is not an integer in its range, or the sequence has no next episode;
+                nothing has changed.
         """
         if seed is not None:
-            checked_number("seed", seed)
+            seed = checked_number("seed", seed)
         number = episode_option(options)
+        if number is None:
+            number = self._episode + 1 if seed is None and self._seed is not None else 0
+        if number == 2**64:
+            raise ValueError(f"episode 2**64 - 1 of seed {self._seed} has no next one: give a seed or an episode")
         super().reset(seed=seed)
-        if seed is not None:
-            self._seed, self._episode = seed, 0
-        elif self._seed is None:
-            self._seed, self._episode = int(self.np_random.integers(2**63)), 0
-        else:
-            self._episode += 1
-        if number is not None:
-            self._episode = number
-        return self._simulation.reset(self._seed, self._episode)
+        if seed is None:
+            seed = int(self.np_random.integers(2**63)) if self._seed is None else self._seed
+        self._seed, self._episode = seed, number
+        return self._simulation.reset(seed, number)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Executes `action`, shape `[n_action]`, for one control step.
@@ -199,18 +200,22 @@ def episode_option(options: dict[str, Any] | None) -> int | None:
     number = options.pop("episode", None)
     if options:
         raise ValueError(f"unknown options {sorted(options)}: expected episode")
-    return None if number is None else checked_number("episode", int(number))
+    return None if number is None else checked_number("episode", number)
 
 
-def checked_number(name: str, number: int) -> int:
+def checked_number(name: str, number: SupportsIndex) -> int:
     """Returns a seed or the number of an episode.
 
     Raises:
-        ValueError: It is not in [0, 2**64).
+        ValueError: It is not an integer in [0, 2**64).
     """
-    if not 0 <= number < 2**64:
-        raise ValueError(f"{name} is {number}, expected 0 to 2**64 - 1")
-    return number
+    try:
+        checked = operator.index(number)
+    except TypeError:
+        raise ValueError(f"{name} is {number!r}, expected an integer") from None
+    if not 0 <= checked < 2**64:
+        raise ValueError(f"{name} is {checked}, expected 0 to 2**64 - 1")
+    return checked
 
 
 def check_rendering(render_mode: str | None, width: int, height: int) -> None:

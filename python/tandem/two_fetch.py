@@ -84,7 +84,7 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
 
     Args:
         task: `"push"` or `"pick-and-place"`.
-        distance: Distance between the starts of the two hands along x, metres.
+        distance: Distance between the starts of the two hands along x, metres; in task push they are 7 mm closer.
         close_goals: Whether the goals are at most 15 cm apart; with False they are at least 10 cm apart.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
@@ -156,10 +156,14 @@ class TwoFetchEnv(gymnasium.Env[Observation, Floats]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode; `options` must be empty."""
-        super().reset(seed=seed)
+        """Starts an episode; `options` must be empty.
+
+        Raises:
+            ValueError: There are options; nothing has changed.
+        """
         if options:
             raise ValueError(f"unknown options {sorted(options)}: expected none")
+        super().reset(seed=seed)
         objects, goals = self._draw_objects(), self._draw_goals()
         return self.start(objects, goals), self._info(False)
 

@@ -74,9 +74,11 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         width: int = 640,
         height: int = 400,
     ) -> None:
-        for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
-            if count < 1:
-                raise ValueError(f"{name} is {count}, expected at least 1")
+        threads = (os.cpu_count() or 1) if num_threads is None else num_threads
+        counts = {"num_envs": num_envs, "max_episode_steps": max_episode_steps, "num_threads": threads}
+        for name, count in counts.items():
+            if not 1 <= count < 2**32:
+                raise ValueError(f"{name} is {count}, expected 1 to 2**32 - 1")
         check_rendering(render_mode, width, height)
         mode = AutoresetMode(autoreset_mode)
         task = task_name(task, world)
@@ -93,7 +95,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
             grasped_start_prob=grasped_start_prob,
             max_episode_steps=max_episode_steps,
             autoreset=_AUTORESET[mode],
-            num_threads=num_threads or os.cpu_count() or 1,
+            num_threads=threads,
         )
         single = _native.Simulation(task, n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob)
         self.single_observation_space, self.single_action_space = spaces_of(single)
@@ -115,19 +117,23 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
             Observations, each of shape `[num_envs, ...]`, and infos.
 
         Raises:
-            ValueError: A seed or an option is out of range; no environment has changed.
+            ValueError: A seed is not an integer in its range, or seeds or options have the wrong length; nothing has
+                changed.
         """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)), dtype=np.bool_)
         if options:
             raise ValueError(f"unknown options {sorted(options)}: expected reset_mask")
+        if mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask has shape {mask.shape}, expected ({self.num_envs},)")
         if isinstance(seed, (int, np.integer)):
             seeds: list[int | None] = [int(seed) + idx for idx in range(self.num_envs)]
         else:
-            seeds = [None] * self.num_envs if seed is None else [None if one is None else int(one) for one in seed]
+            seeds = [None] * self.num_envs if seed is None else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seeds has length {len(seeds)}, expected {self.num_envs}")
         for idx, one in enumerate(seeds):
-            if one is not None:
-                checked_number(f"the seed of environment {idx}", one)
+            seeds[idx] = None if one is None else checked_number(f"the seed of environment {idx}", one)
         super().reset(seed=seed if isinstance(seed, int) else None)
         if not self._is_seeded and None in seeds:
             drawn = self.np_random.integers(2**63, size=len(seeds)).tolist()

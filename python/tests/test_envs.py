@@ -117,8 +117,15 @@ def test_bad_actions_are_refused_and_change_nothing():
         (np.zeros((1, 6), np.float32), r"shape \(1, 6\), expected \(6,\)"),
         (np.zeros((6, 1)), r"shape \(6, 1\), expected \(6,\)"),
         (np.float32(0), r"shape \(\), expected \(6,\)"),
+        ([[0.0] * 6], r"shape \(1, 6\), expected \(6,\)"),
+        (((0,),) * 6, r"shape \(6, 1\), expected \(6,\)"),
+        ([[0.0], [0.0, 0.0]], r"rows of different lengths, expected shape \(6,\)"),
+        (0, r"shape \(\), expected \(6,\)"),
     ]:
         with pytest.raises(ValueError, match=message):
+            env.step(action)
+    for action in (None, ["left"] * 6):
+        with pytest.raises(TypeError):
             env.step(action)
     after = env.step(np.zeros(6))[0]
     env.reset(seed=4)
@@ -165,10 +172,34 @@ def test_a_refused_seed_or_number_changes_nothing():
         ({"seed": -1}, "seed is -1"),
         ({"options": {"episode": -1}}, "episode is -1"),
         ({"seed": 3, "options": {"episode": 2**64}}, "episode is 18446744073709551616"),
+        ({"seed": 3.5}, "seed is 3.5, expected an integer"),
+        ({"options": {"episode": 1.9}}, "episode is 1.9, expected an integer"),
+        ({"options": {"episode": "1"}}, "episode is '1', expected an integer"),
     ]:
         with pytest.raises(ValueError, match=message):
             env.reset(**arguments)
     assert all(map(np.array_equal, arrays_of(env.reset()[0]), arrays_of(other.reset()[0])))
+
+
+def test_numbers_of_numpy_are_seeds_and_numbers_of_episodes():
+    env, other = tandem.TandemEnv("push", 1), tandem.TandemEnv("push", 1)
+    start, _ = env.reset(seed=np.uint64(2**64 - 1), options={"episode": np.int32(2)})
+    expected, _ = other.reset(seed=2**64 - 1, options={"episode": 2})
+    assert all(map(np.array_equal, arrays_of(start), arrays_of(expected)))
+
+
+def test_the_last_episode_of_a_seed_has_no_next_one():
+    env, other = tandem.TandemEnv("push", 1), tandem.TandemEnv("push", 1)
+    env.reset(seed=5, options={"episode": 2**64 - 1})
+    other.reset(seed=5, options={"episode": 2**64 - 1})
+    for _ in range(2):
+        with pytest.raises(ValueError, match="of seed 5 has no next one: give a seed or an episode"):
+            env.reset()
+    stepped = [each.step(np.ones(3))[0] for each in (env, other)]
+    assert all(map(np.array_equal, *map(arrays_of, stepped))), "the episode continues"
+    env.reset(options={"episode": 6})
+    expected, _ = other.reset(seed=5, options={"episode": 7})
+    assert all(map(np.array_equal, arrays_of(env.reset()[0]), arrays_of(expected)))
 
 
 def test_grasped_starts_hold_the_cube_in_the_hand():

@@ -107,6 +107,13 @@ def test_a_state_is_evaluated_alone_unless_the_policy_is_batched():
             assert sizes == expected
 
 
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_request_without_states_has_an_empty_answer(batched):
+    with tandem.PolicyServer(follow, task="push", value=closeness, batched=batched) as server:
+        assert evaluate(server, m=0) == pb.EvaluatePolicyResponse()
+        assert stub(server).Evaluate(pb.EvaluatePolicyRequest()) == pb.EvaluatePolicyResponse()
+
+
 def test_the_digest_changes_with_the_policy():
     def gentle(observation, goal):
         return follow(observation, goal) / 2

@@ -118,6 +118,13 @@ def test_starts_and_goals_are_apart_but_the_areas_overlap(close_goals, nearest, 
     assert np.max(reached, axis=0)[0] > np.min(reached, axis=0)[1], "the areas of the goals overlap"
 
 
+@pytest.mark.parametrize(("task", "apart_m"), [("push", 0.1928), ("pick-and-place", 0.1999)])
+def test_hands_start_twenty_centimetres_apart_and_in_push_seven_millimetres_less(task, apart_m):
+    env = TwoFetchEnv(task, distance=0.2)
+    first, second = arms_of(env.reset(seed=1)[0]["observation"])
+    assert env.tandem_task["origin_distance"] - first[0] - second[0] == pytest.approx(apart_m, abs=2e-4)
+
+
 def test_contacts_between_the_robots_are_reported():
     env = TwoFetchEnv("pick-and-place", distance=0.25)
     env.reset(seed=1)
@@ -149,6 +156,15 @@ def test_bad_actions_and_arguments_are_refused():
     for arguments in ({"task": "lift"}, {"distance": 0.01}, {"distance": 0.5}, {"render_mode": "human"}):
         with pytest.raises(ValueError, match="expected"):
             TwoFetchEnv(**arguments)
+
+
+def test_a_refused_reset_changes_nothing():
+    env, other = TwoFetchEnv("push"), TwoFetchEnv("push")
+    for each in (env, other):
+        each.reset(seed=4)
+    with pytest.raises(ValueError, match="unknown options"):
+        env.reset(seed=9, options={"episode": 1})
+    assert np.array_equal(env.reset()[0]["observation"], other.reset()[0]["observation"])
 
 
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -106,13 +106,28 @@ def test_bad_actions_are_refused_and_move_no_environment():
 
 
 def test_arguments_out_of_range_are_refused():
-    for arguments, message in [({"num_envs": 0}, "num_envs"), ({"num_envs": 1, "max_episode_steps": 0}, "max_ep")]:
+    for name in ("num_envs", "max_episode_steps", "num_threads"):
+        for count in (-1, 0, 2**32, 2**64):
+            with pytest.raises(ValueError, match=rf"{name} is {count}, expected 1 to 2\*\*32 - 1"):
+                tandem.TandemVectorEnv(**{"num_envs": 1, name: count})
+    longest = tandem.TandemVectorEnv(1, max_episode_steps=2**32 - 1, num_threads=2**32 - 1)
+    assert longest.reset(seed=1)[0]["observation"].shape == (1, 56)
+
+
+def test_a_refused_reset_changes_nothing():
+    envs, other = (tandem.TandemVectorEnv(2, "push", 1) for _ in range(2))
+    for each in (envs, other):
+        each._np_random = np.random.default_rng(7)
+    for arguments, message in [
+        ({"seed": [1]}, "seeds has length 1"),
+        ({"seed": [1, 2.5]}, "the seed of environment 1 is 2.5, expected an integer"),
+        ({"seed": 2**64 - 1}, "the seed of environment 1 is 18446744073709551616"),
+        ({"seed": 3, "options": {"reset_mask": [True]}}, r"reset_mask has shape \(1,\), expected \(2,\)"),
+        ({"seed": 3, "options": {"mask": [True, True]}}, "unknown options"),
+    ]:
         with pytest.raises(ValueError, match=message):
-            tandem.TandemVectorEnv(**arguments)
-    with pytest.raises(ValueError, match="seeds has length 1"):
-        tandem.TandemVectorEnv(2).reset(seed=[1])
-    with pytest.raises(ValueError, match="the seed of environment 1 is 18446744073709551616"):
-        tandem.TandemVectorEnv(2).reset(seed=2**64 - 1)
+            envs.reset(**arguments)
+    assert_equal(envs.reset()[0], other.reset()[0])
 
 
 def test_an_environment_without_a_seed_of_its_own_continues():
