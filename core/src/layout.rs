@@ -14,7 +14,8 @@ pub const GOAL_PER_ARM: usize = 3;
 pub const HAND_POSITION: Range<usize> = 0..3;
 /// Range of the object's position within its arm's part of an observation.
 pub const OBJECT_POSITION: Range<usize> = 3..6;
-/// Distance between the workspace centres of two arms, which are the origins of their frames, metres.
+/// Distance between the origins of the frames of two arms, metres. In the classic world these are the centres of their
+/// workspaces.
 ///
 /// The second arm is the first one rotated by 180° about z, so each arm's x axis points at the other arm.
 pub const WORKSPACE_DISTANCE_M: f32 = 0.24;

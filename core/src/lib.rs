@@ -64,9 +64,9 @@
 //! ```
 //!
 //! The vector of several arms is the concatenation of the vectors of each arm. Positions are metres, angles radians and
-//! actions numbers in [−1, 1]; each arm's part is in the arm's own frame (origin on the table in the centre of its
-//! workspace, x away from the base, z up). A policy for one arm can therefore use a part unchanged, which is how a
-//! one-arm teacher advises a two-arm student:
+//! actions numbers in [−1, 1]; each arm's part is in the arm's own frame (origin on the table ahead of its base, x away
+//! from the base, z up). A policy for one arm can therefore use a part unchanged, which is how a one-arm teacher advises
+//! a two-arm student:
 //!
 //! ```
 //! # use tandem_core::{ArmIndex, Layout, Task};

@@ -108,8 +108,8 @@ impl ArmModel {
         self.joints.len()
     }
 
-    /// Returns the shoulder in the base frame, metres: the point of joint 1's axis nearest to the axis of joint 2,
-    /// which passes it at a distance of 1.6 mm.
+    /// Returns the shoulder in the base frame, metres: the point where the axes of joints 1 and 2 meet. The origin of
+    /// joint 2 lies on its axis, 1.6 mm from this point.
     #[must_use]
     pub fn shoulder_m(&self) -> Point3<f64> {
         Point3::new(0.0, 0.0, self.joints[0].origin_m().z - self.joints[1].origin_m().z)

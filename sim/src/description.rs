@@ -316,7 +316,10 @@ fn contact_pairs(world: &World) -> Vec<ContactPairDescription> {
     let mut pairs = Vec::new();
     for (second, of_second) in colliders.iter().enumerate() {
         for (first, of_first) in colliders[..second].iter().enumerate() {
-            if of_first.collision_groups().test(of_second.collision_groups()) {
+            // Shapes of one body move together.
+            let in_one_body =
+                of_first.parent().is_some() && of_first.parent() == of_second.parent();
+            if !in_one_body && of_first.collision_groups().test(of_second.collision_groups()) {
                 let friction = CoefficientCombineRule::combine(
                     of_first.friction(),
                     of_second.friction(),

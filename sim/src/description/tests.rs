@@ -45,6 +45,17 @@ fn arms_that_share_an_object_bring_two_points_of_one_body_to_their_goals() {
 }
 
 #[test]
+fn no_pair_has_two_shapes_of_one_body() {
+    for task in Task::ALL {
+        let world = described(task, 2);
+        for pair in &world.contact_pairs {
+            let [first, second] = pair.shapes.map(|shape| world.shapes[shape].body);
+            assert!(first.is_none() || first != second, "{task}: {pair:?}");
+        }
+    }
+}
+
+#[test]
 fn pairs_have_the_friction_of_the_decision_records_and_hands_do_not_collide_with_themselves() {
     let world = described(Task::PickAndPlace, 2);
     let mut frictions: Vec<f32> = Vec::new();
