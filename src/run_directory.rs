@@ -2,7 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::exit::{Failed, OrExit as _};
+use tandem_system::DirectoryLock;
+
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_file;
 
 /// The directory that holds the runs without `--out`.
@@ -53,6 +55,12 @@ fn runs_in(parent: &Path) -> Vec<PathBuf> {
         directories.filter(|directory| directory.join("run.toml").is_file()).collect();
     runs.sort();
     runs
+}
+
+/// Locks a directory; `None` if another process has locked it.
+pub(crate) fn lock(directory: &Path) -> Result<Option<DirectoryLock>, Failed> {
+    let cannot = || format!("cannot lock {}", directory.display());
+    DirectoryLock::try_take(directory).or_exit(Exit::TryAgain, cannot)
 }
 
 /// Rejects a path at which no directory can be created: a file, or a path below one.

@@ -63,6 +63,30 @@ fn trials_before_a_failure_are_kept() {
 }
 
 #[test]
+fn a_directory_belongs_to_one_process_at_a_time() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let lock = tandem_system::DirectoryLock::try_take(dir.path()).expect("locks").expect("free");
+    let args = ["--policy", STUDENT, "--mode", "closed-loop", "--trials", "1"];
+    let output = trial(dir.path(), &args);
+    let error = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(75), "{error}");
+    assert!(error.contains("another process uses") && error.lines().count() == 1, "{error}");
+    assert!(!dir.path().join("trials.jsonl").exists());
+
+    // Without --out the next directory is taken.
+    let first = dir.path().join("runs/trial-push");
+    std::fs::create_dir_all(&first).expect("created");
+    let first = tandem_system::DirectoryLock::try_take(&first).expect("locks").expect("free");
+    let root = env!("CARGO_MANIFEST_DIR");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    command.args(["bridge", "trial", "--policy"]).arg(Path::new(root).join(STUDENT));
+    command.args(&args[2..]).current_dir(dir.path()).env_remove("RUST_LOG");
+    assert!(command.output().expect("runs").status.success());
+    assert_eq!(rows(&dir.path().join("runs/trial-push.2")).len(), 1);
+    drop((lock, first));
+}
+
+#[test]
 fn reports_know_every_cause_of_failure() {
     assert_eq!(tandem_report::trials::CAUSES, tandem_trials::trial::FailureCause::NAMES);
 }
@@ -81,7 +105,7 @@ fn unusable_arguments_are_reported_in_one_line() {
     check(&["--composed-teachers", STUDENT], 64, "a teacher drives one");
     check(&["--policy", STUDENT, "--task", "pick-and-place"], 64, "is for push");
     check(&["--policy", STUDENT, "--block-cm", "20"], 64, "expected 3 to 9");
-    check(&["--policy", STUDENT, "--speed", "2"], 64, "at most 1");
+    check(&["--policy", STUDENT, "--speed", "1e-9"], 64, "expected 0.01 to 1");
     check(&["--policy", STUDENT, "--pad-friction", "nan"], 64, "expected 0 to 2");
     let bar = ["--composed-teachers", GRASPING_TEACHER, "--task", "carry-bar"];
     check(&[&bar[..], &["--block-cm", "5"]].concat(), 64, "keeps its size");

@@ -11,6 +11,7 @@ use tandem_core::text::counted;
 use tandem_core::{Layout, Task};
 use tandem_policy::policy::RANDOMIZATION_KEY;
 use tandem_report::{Comparison, PlottedTrials, report_html};
+use tandem_system::DirectoryLock;
 use tandem_telemetry::trials::TRIALS_FILE;
 use tandem_telemetry::{TrialRow, TrialsLog};
 use tandem_trials::simulated::{Block, GripperConfig};
@@ -21,7 +22,7 @@ use tandem_trials::{NamedPolicy, Series, SeriesError, SimulatedConfig};
 use crate::bridge::file;
 use crate::cli::{ModeName, RecordName, TaskName, TrialArgs, check_task};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{output, policy_file};
+use crate::{output, policy_file, run_directory};
 
 /// Density of the blocks, kilograms per cubic metre: a block of 5.6 cm has 0.12 kg.
 const DENSITY_KGPM3: f32 = 683.3;
@@ -40,9 +41,8 @@ const LOGS: &str = "mcap";
 pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     let (task, policies) = policies(args)?;
     let block = block(args.block_cm, task)?;
-    if !(args.speed > 0.0 && args.speed <= 1.0) {
-        let message = format!("--speed {}: expected more than 0 and at most 1", args.speed);
-        return Err(Failed::usage(message));
+    if !(0.01..=1.0).contains(&args.speed) {
+        return Err(Failed::usage(format!("--speed {}: expected 0.01 to 1", args.speed)));
     }
     if !(0.0..=2.0).contains(&args.pad_friction) {
         let message = format!("--pad-friction {}: expected 0 to 2", args.pad_friction);
@@ -58,8 +58,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
             mode.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
         return Err(Failed::usage(format!("--mode {name} is given twice")));
     }
-    let out = args.out.clone().unwrap_or_else(|| free_directory(task));
-    create_directory(&out)?;
+    let (out, _lock) = locked_directory(args.out.as_deref(), task)?;
     if args.motions {
         create_directory(&out.join(MOTIONS))?;
     }
@@ -94,16 +93,36 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
     show(args, all, &file)
 }
 
-/// Returns `runs/trial-TASK`, and the same with a number appended if that has trials.
-fn free_directory(task: Task) -> PathBuf {
-    let base = format!("runs/trial-{task}");
-    let numbered = (2..).map(|n: u32| PathBuf::from(format!("{base}.{n}")));
+/// Creates and locks the directory `out`. Without one it is `runs/trial-TASK`, with a number appended if that has trials or
+/// if another process writes to it.
+fn locked_directory(out: Option<&Path>, task: Task) -> Result<(PathBuf, DirectoryLock), Failed> {
     let has_trials =
-        |out: &PathBuf| std::fs::metadata(out.join(TRIALS_FILE)).is_ok_and(|file| file.len() > 0);
-    std::iter::once(PathBuf::from(&base))
-        .chain(numbered)
-        .find(|out| !has_trials(out))
-        .unwrap_or(base.into())
+        |out: &Path| std::fs::metadata(out.join(TRIALS_FILE)).is_ok_and(|file| file.len() > 0);
+    if let Some(out) = out {
+        create_directory(out)?;
+        let lock = run_directory::lock(out)?.ok_or_else(|| {
+            Failed::new(
+                Exit::TryAgain,
+                anyhow::anyhow!(
+                    "another process uses {}: wait until it exits, or choose another --out",
+                    out.display()
+                ),
+            )
+        })?;
+        return Ok((out.to_owned(), lock));
+    }
+    let base = format!("runs/trial-{task}");
+    let mut out = PathBuf::from(&base);
+    for n in 2_u64.. {
+        create_directory(&out)?;
+        if let Some(lock) = run_directory::lock(&out)?
+            && !has_trials(&out)
+        {
+            return Ok((out, lock));
+        }
+        out = format!("{base}.{n}").into();
+    }
+    unreachable!("a number is free")
 }
 
 /// Returns half the edge of the blocks that `policy` was trained with, metres. Where sizes varied it knows those of `block`.

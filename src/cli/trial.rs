@@ -49,7 +49,7 @@ pub(crate) struct TrialArgs {
     #[arg(long, value_name = "N", default_value_t = 16,
         value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) rehearsals: u32,
-    /// Fraction of the highest speed, above 0 and at most 1.
+    /// Fraction of the highest speed, 0.01 to 1.
     #[arg(long, default_value_t = 1.0)]
     pub(crate) speed: f64,
     /// Edge of the blocks in cm; 4.5 in training, 9 in the paper's trials. An object that both arms share keeps its size

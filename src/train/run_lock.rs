@@ -7,7 +7,8 @@ use tandem_system::DirectoryLock;
 use tandem_teacher::ledger::{OpenError, SqliteLedger};
 
 use super::plan::Plan;
-use crate::exit::{Exit, Failed, OrExit as _};
+use crate::exit::{Exit, Failed};
+use crate::run_directory::lock;
 use crate::{clock, output, run_directory, service};
 
 /// Time that a process which was just killed may take to release its lock.
@@ -66,11 +67,6 @@ impl RunLock {
     pub(super) fn is_in_place(&self) -> bool {
         self.0.is_in_place()
     }
-}
-
-fn lock(directory: &Path) -> Result<Option<DirectoryLock>, Failed> {
-    let cannot = || format!("cannot lock {}", directory.display());
-    DirectoryLock::try_take(directory).or_exit(Exit::TryAgain, cannot)
 }
 
 /// Opens the ledger, or returns `None` while another process has it open.
