@@ -5,6 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use serde_json::Value;
+use tandem_core::TaskSpec;
+use tandem_core::task::Reflection;
+use tandem_policy::{MlpShape, Policy};
 
 const TEACHER: &str = "policies/teacher-push.safetensors";
 /// An actor that PyTorch exported, with tanh between its layers.
@@ -78,6 +81,62 @@ fn a_policy_comes_back_from_onnx_as_it_went() {
 }
 
 #[test]
+fn a_policy_of_a_wide_task_goes_to_onnx() {
+    let files = Files::new();
+    let mut policy = Policy::load(Path::new(TEACHER)).expect("shipped");
+    let mut description = policy.layout.description().clone();
+    description.name = "lab/wide".to_owned();
+    description.reflection = Reflection::default();
+    let n_added = 1100 - description.n_observation;
+    description.n_observation = 1100;
+    description.observation_bound.resize(1100, 1.0);
+    // The added numbers, which belong to no arm, follow the others, and have the weight 0.
+    let widened = |shape: MlpShape, parameters: &[f32], n_goal_and_action: usize| {
+        let n_in = shape.layer_input(0);
+        let rows = parameters[shape.weight(0)].chunks(n_in);
+        let mut wide: Vec<f32> = Vec::new();
+        for row in rows {
+            let (observation, rest) = row.split_at(n_in - n_goal_and_action);
+            wide.extend(observation.iter().chain(&vec![0.0; n_added]).chain(rest));
+        }
+        wide.extend(&parameters[shape.weight(0).end..]);
+        wide
+    };
+    let n_goal = policy.layout.n_goal();
+    policy.actor = widened(policy.actor_shape(), &policy.actor, n_goal);
+    let n_rest = n_goal + policy.layout.n_action();
+    policy.critic = widened(policy.critic_shape(), &policy.critic, n_rest);
+    policy.observation_normalizer.mean.resize(1100, 0.0);
+    policy.observation_normalizer.std.resize(1100, 1.0);
+    policy.layout = TaskSpec::new(description).expect("consistent");
+    let wide = files.name("wide.safetensors");
+    policy.save(Path::new(&wide)).expect("valid");
+
+    let [actor, critic, back] = ["a.onnx", "c.onnx", "b.safetensors"].map(|name| files.name(name));
+    json(&["policy", "export", &wide, "--onnx", &actor, "--critic-onnx", &critic, "--json"]);
+    let import = ["policy", "import", &actor, "--critic", &critic, "--out", &back, "--json"];
+    assert_eq!(json(&import)["digest"], policy.digest());
+}
+
+#[test]
+fn a_symmetrised_policy_has_no_result_of_an_evaluation() {
+    let files = Files::new();
+    let [student, out] =
+        ["student.safetensors", "symmetrised.safetensors"].map(|name| files.name(name));
+    let mut policy = Policy::load(Path::new("policies/student-push.safetensors")).expect("shipped");
+    policy.metadata.remove("symmetrized");
+    policy.save(Path::new(&student)).expect("valid");
+    let student = student.as_str();
+    assert!(tandem(&["policy", "symmetrize", student, "--out", &out]).status.success());
+    let metadata = |file: &str| json(&["policy", "show", file, "--json"])["metadata"].clone();
+    let (before, after) = (metadata(student), metadata(&out));
+    assert!(before["evaluation_success"].is_string() && after["evaluation_success"].is_null());
+    assert!(after["evaluation_episodes"].is_null());
+    assert_eq!(before["evaluation_seed"], after["evaluation_seed"]);
+    refused(&["policy", "symmetrize", student, "--out", student], 64, "is the same file");
+}
+
+#[test]
 fn a_network_from_elsewhere_takes_the_task_of_a_server() {
     let files = Files::new();
     let import = |more: &[&str]| {
@@ -108,6 +167,13 @@ fn what_cannot_be_converted_is_refused_in_one_line() {
         "it has 3 numbers, an action of shared-pick-and-place with 1 arm has 4",
     );
     refused(&["policy", "import", TEACHER, "--out", &out], 65, "it is not a complete ONNX file");
+    refused(
+        &["policy", "import", &actor, "--critic", FOREIGN, "--out", &out],
+        65,
+        "normalized-tanh-actor.dynamo.onnx\" is not a usable ONNX model",
+    );
+    let bar = ["--task", "carry-bar", "--arms", "1", "--out", &out];
+    refused(&[&["policy", "import", &actor][..], &bar].concat(), 64, "carry-bar takes two arms");
     refused(&["eval", "--policy", &actor], 64, "is an ONNX model: convert it with `tandem policy");
     refused(&["policy", "export", TEACHER, "--onnx", "/no/such/actor.onnx"], 64, "cannot write");
     json(&["policy", "import", &actor, "--out", &out, "--json"]);

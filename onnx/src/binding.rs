@@ -162,6 +162,45 @@ pub fn layout_of(model: &Model, role: Role) -> Result<TaskSpec, ModelError> {
     }
 }
 
+/// Checks that the metadata of the models does not contradict that they belong together.
+///
+/// # Errors
+/// When they are for different tasks, or parts of different policies.
+pub fn check_pair(actor: &Model, critic: &Model) -> Result<(), ModelError> {
+    let layout = |model: &Model| layout_in_metadata(&model.metadata).ok().flatten();
+    if let (Some(of_actor), Some(of_critic)) = (layout(actor), layout(critic))
+        && of_actor != of_critic
+    {
+        let text = |layout: &TaskSpec| {
+            format!("{} with {}", layout.name(), counted(layout.n_arms(), "arm"))
+        };
+        let (actor, critic) = (text(&of_actor), text(&of_critic));
+        let problem = match actor == critic {
+            false => format!("its metadata says {critic}, the actor's says {actor}"),
+            true => format!("its metadata describes {critic} otherwise than the actor's"),
+        };
+        return Err(ModelError::Model(problem));
+    }
+    let policy = |model: &Model| model.metadata.get(metadata::POLICY_DIGEST).cloned();
+    match (policy(actor), policy(critic)) {
+        (Some(of_actor), Some(of_critic)) if of_actor != of_critic => {
+            Err(ModelError::Model(format!(
+                "it belongs to another policy than the actor: the metadata {:?} differs",
+                metadata::POLICY_DIGEST
+            )))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Returns true if the metadata of `model` names its task, rightly or wrongly.
+#[must_use]
+pub fn names_task(model: &Model) -> bool {
+    [metadata::TASK_DESCRIPTION, metadata::TASK, metadata::N_ARMS]
+        .iter()
+        .any(|key| model.metadata.contains_key(*key))
+}
+
 fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<TaskSpec>, ModelError> {
     let refused = |key: &str, value: &str, expected: String| {
         let value = tandem_core::text::shortened(value, 80);
@@ -176,9 +215,14 @@ fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<TaskS
             serde_json::from_str(text).map_err(|error| problem(&error))?;
         return TaskSpec::new(description).map(Some).map_err(|error| problem(&error));
     }
-    let (Some(task), Some(n_arms)) = (entries.get(metadata::TASK), entries.get(metadata::N_ARMS))
-    else {
-        return Ok(None);
+    let missing = |key: &str, other: &str| {
+        ModelError::Model(format!("metadata {other:?} is present, {key:?} is missing"))
+    };
+    let (task, n_arms) = match (entries.get(metadata::TASK), entries.get(metadata::N_ARMS)) {
+        (Some(task), Some(n_arms)) => (task, n_arms),
+        (None, None) => return Ok(None),
+        (Some(_), None) => return Err(missing(metadata::N_ARMS, metadata::TASK)),
+        (None, Some(_)) => return Err(missing(metadata::TASK, metadata::N_ARMS)),
     };
     let task = task.parse::<Task>().map_err(|_unknown| {
         refused(metadata::TASK, task, format!("one of {}", Task::ALL.map(Task::name).join(", ")))

@@ -8,6 +8,8 @@ mod node;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use tandem_core::task::MAX_NUMBERS;
+
 use crate::error::ModelError;
 use crate::network::{Column, Input, Layer, Network, Op, Step};
 use crate::onnx_proto::{FLOAT, GraphProto, NodeProto, ValueInfoProto};
@@ -17,10 +19,10 @@ use constant::Constant;
 const MAX_NODES: usize = 1024;
 /// Largest accepted number of inputs.
 const MAX_INPUTS: usize = 16;
-/// Largest accepted length of a row of an input: more than eight arms need.
-const MAX_INPUT_WIDTH: usize = 1024;
+/// Largest accepted length of a row of an input: an observation, a goal and an action.
+const MAX_INPUT_WIDTH: usize = 3 * MAX_NUMBERS;
 /// Largest accepted number of numbers that enter the first layer.
-const MAX_COLUMNS: usize = 2048;
+const MAX_COLUMNS: usize = 2 * MAX_INPUT_WIDTH;
 /// Memory that the interpretation may take besides four times the size of the file.
 const EXTRA_BYTES: usize = 16 << 20;
 /// Names that select the output of a model with several.

@@ -11,6 +11,7 @@ mod layers;
 use std::collections::BTreeMap;
 
 use tandem_core::TaskSpec;
+use tandem_core::text::counted;
 use tandem_policy::policy::{MAX_HIDDEN_LAYERS, NO_CRITIC};
 use tandem_policy::{MlpShape, NormalizerSnapshot, Policy};
 
@@ -44,6 +45,12 @@ pub fn import(
         })
         .transpose()?;
     let n_heads = critic_network.as_ref().map_or(1, |critic| critic.n_output());
+    if n_heads != 1 && n_heads != layout.n_arms() {
+        return Err(ModelError::NotRepresentable(format!(
+            "its critic has {n_heads} values, expected 1, or one for each of {}",
+            counted(layout.n_arms(), "arm")
+        )));
+    }
     let both = || [Some(&actor_network), critic_network.as_ref()].into_iter().flatten();
     let n_hidden = both().map(Converted::widest).max().unwrap_or(1);
     let n_hidden_layers = both().map(|network| network.layers.len() - 1).max().unwrap_or(1);
@@ -69,6 +76,15 @@ pub fn import(
     policy.check()?;
     policy.metadata = metadata_of(&policy, actor, critic);
     Ok(policy)
+}
+
+/// Checks that the network of one model fits `layout` and that a policy file can represent it, so that an error of
+/// [`import`] concerns both models.
+///
+/// # Errors
+/// When it does not, or cannot.
+pub fn check(model: &Model, role: Role, layout: &TaskSpec) -> Result<(), ModelError> {
+    Converted::new(&BoundNetwork::new(model, role, layout)?, role).map(drop)
 }
 
 /// Refuses networks that padding would make larger than a policy can be.
@@ -121,7 +137,12 @@ impl Converted {
     fn new(network: &BoundNetwork, role: Role) -> Result<Self, ModelError> {
         let sources = network.sources().iter().copied();
         let columns = sources.zip(&network.network().columns).map(|(source, column)| {
-            Ok((source, normalized(source, column).map_err(ModelError::NotRepresentable)?))
+            let bound = match source {
+                Source::Observation(i) => network.layout().observation_bound(i),
+                Source::Goal(i) => network.layout().goal_bound(i),
+                Source::Action(_) => 1.0,
+            };
+            Ok((source, normalized(source, column, bound).map_err(ModelError::NotRepresentable)?))
         });
         let layers = dense_layers(network.network(), role).map_err(ModelError::NotRepresentable)?;
         Ok(Self { columns: columns.collect::<Result<_, ModelError>>()?, layers })

@@ -21,8 +21,8 @@ pub const POLICY_DIGEST: &str = "policy_digest";
 /// Start of the keys of the policy's own metadata.
 pub const TRAINING: &str = "training.";
 
-const FRAME: &str = "each arm's own frame: origin in the centre of its workspace on the table, x away from its base, \
-    z up; the numbers of several arms are concatenated in arm order";
+const FRAME: &str = "each arm's own frame: origin on the table ahead of its base, x away from the base, z up; the \
+    numbers of several arms are concatenated in arm order";
 
 /// A part of one arm's observation: first index, name and unit. It ends where the next one starts.
 type Part = (usize, &'static str, &'static str);

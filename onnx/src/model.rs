@@ -67,9 +67,15 @@ impl Model {
             producer: producer.trim().to_owned(),
             ir_version: model.ir_version,
             opset,
-            digest: hex(&Sha256::digest(file)),
+            digest: digest(file),
         })
     }
+}
+
+/// Returns the digest of a model's file: its SHA-256, hexadecimal.
+#[must_use]
+pub fn digest(file: &[u8]) -> String {
+    hex(&Sha256::digest(file))
 }
 
 /// Returns the SHA-256, hexadecimal, over the digests of several files.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
-use super::{TaskName, WorldName};
+use super::{EnvironmentArgs, TaskName, WorldName};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -83,7 +83,7 @@ pub(crate) struct ImportArgs {
     #[arg(long, value_name = "FILE.onnx")]
     pub(crate) critic: Option<PathBuf>,
     /// Task [default: the one in the model's metadata, or the one of the classic world that the model fits].
-    #[arg(long, value_parser = TaskName::parser(), requires = "arms")]
+    #[arg(long, value_parser = TaskName::parser(), requires = "arms", conflicts_with_all = ["env", "env_command"])]
     pub(crate) task: Option<TaskName>,
     /// World of the task [default: shared].
     #[arg(long, value_enum, requires = "task")]
@@ -91,12 +91,8 @@ pub(crate) struct ImportArgs {
     /// Number of arms [default: as for --task].
     #[arg(long, value_name = "N", requires = "task", value_parser = clap::value_parser!(u8).range(1..=8))]
     pub(crate) arms: Option<u8>,
-    /// The task is that of the server of environments at this address.
-    #[arg(long, value_name = "ADDR", conflicts_with = "task")]
-    pub(crate) env: Option<String>,
-    /// The task is that of the server of environments that this shell command starts.
-    #[arg(long, value_name = "CMD", conflicts_with_all = ["env", "task"])]
-    pub(crate) env_command: Option<String>,
+    #[command(flatten)]
+    pub(crate) environment: EnvironmentArgs,
     /// Output file.
     #[arg(long, value_name = "FILE.safetensors")]
     pub(crate) out: PathBuf,

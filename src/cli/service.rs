@@ -168,10 +168,10 @@ pub(crate) struct LearnerArgs {
 /// The server of environments.
 #[derive(Debug, Clone, Default, PartialEq, Args)]
 pub(crate) struct EnvironmentArgs {
-    /// Plays in the environments of the server at this address [default: simulates the environments in the worker].
+    /// The environments are those of the server at this address [default: the built-in ones].
     #[arg(long, value_name = "ADDR")]
     pub(crate) env: Option<String>,
-    /// Plays in the environments of a server that this shell command starts, one server per worker. The command reads
+    /// The environments are those of a server that this shell command starts, one server per worker. The command reads
     /// the address from TANDEM_ENV_LISTEN and prints `listening on http://HOST:PORT`.
     #[arg(long, value_name = "CMD", conflicts_with = "env")]
     pub(crate) env_command: Option<String>,

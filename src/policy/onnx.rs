@@ -6,19 +6,23 @@ use serde_json::json;
 use tandem_core::rng::uniform;
 use tandem_core::task::Norm;
 use tandem_core::{Layout, Stream, TaskSpec, episode_rng};
-use tandem_onnx::binding::layout_of;
+use tandem_onnx::binding::{check_pair, layout_of, names_task};
+use tandem_onnx::import::check as check_representable;
+use tandem_onnx::model::digest;
 use tandem_onnx::{
     BoundNetwork, Error, Model, ModelError, Role, export as write, import as convert,
 };
 use tandem_policy::Policy;
 use tandem_system::atomic_file;
 
-use crate::cli::{EnvironmentArgs, ExportArgs, ImportArgs};
+use crate::cli::{ExportArgs, ImportArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{output, policy_file, served_task};
 
 /// Number of random states on which an imported policy is compared with its models.
 const N_COMPARED: usize = 1000;
+/// The context of a refusal of a model whose task is not known.
+const UNKNOWN_TASK: &str = "the task is unknown, name it with --task, --env or --env-command";
 /// Largest accepted difference, relative to values above 1.
 const TOLERANCE: f32 = 1e-4;
 
@@ -40,10 +44,9 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
     for (role, path, encode) in networks {
         let Some(path) = path else { continue };
         let file = encode(&policy).or_exit(Exit::Data, String::new)?;
-        let model = Model::decode(&file).or_exit(Exit::Bug, String::new)?;
         atomic_file::replace(path, &file)
             .or_cannot_write(|| format!("cannot write {}", path.display()))?;
-        written.push((role, path, model.digest));
+        written.push((role, path, digest(&file)));
     }
     if args.json {
         let file = |(role, path, digest): &(&str, &PathBuf, String)| json!({ "role": role, "file": path.to_string_lossy(), "digest": digest });
@@ -66,20 +69,12 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     let critic = args.critic.as_deref().map(Model::load).transpose();
     let critic = critic.or_exit(Exit::Data, String::new)?;
     let refused = |source| refused(&args.actor, source);
-    let layout = match (args.task, args.arms, served_task(args)?) {
-        (Some(task), Some(n_arms), _) => {
-            Layout::new(task.in_named_world(args.world)?, usize::from(n_arms)).into()
-        }
-        (.., Some(task)) => task,
-        _ => layout_of(&actor, Role::Actor).map_err(|source| {
-            let remedy = "the task is unknown, name it with --task, --env or --env-command";
-            refused(source).context(remedy.to_owned())
-        })?,
-    };
-    // The critic alone is bound first, so that an error names its file.
+    let layout = layout(args, &actor)?;
+    // The critic alone is checked first, so that an error names its file.
     if let Some((critic, path)) = critic.as_ref().zip(args.critic.as_ref()) {
-        let bound = BoundNetwork::new(critic, Role::Critic, &layout);
-        bound.map_err(|source| self::refused(path, source))?;
+        let checked = check_pair(&actor, critic);
+        let checked = checked.and_then(|()| check_representable(critic, Role::Critic, &layout));
+        checked.map_err(|source| self::refused(path, source))?;
     }
     let policy = convert(&actor, critic.as_ref(), &layout).map_err(refused)?;
     let differences = compare(&policy, &actor, critic.as_ref()).map_err(refused)?;
@@ -115,18 +110,26 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     ))
 }
 
-/// Asks the server of environments that the arguments name, if they name one, for its task.
-fn served_task(args: &ImportArgs) -> Result<Option<TaskSpec>, Failed> {
-    let server = EnvironmentArgs {
-        env: args.env.clone(),
-        env_command: args.env_command.clone(),
-        ..EnvironmentArgs::default()
-    };
-    Ok(served_task::of_server(&server)?.map(|served| served.task))
+/// Returns the layout that the arguments name, or else the one that the model names or fits.
+fn layout(args: &ImportArgs, actor: &Model) -> Result<TaskSpec, Failed> {
+    if let (Some(task), Some(n_arms)) = (args.task, args.arms) {
+        let task = task.in_named_world(args.world)?;
+        if usize::from(n_arms) < task.min_arms() {
+            return Err(Failed::usage(format!("--arms {n_arms}: {task} takes two arms")));
+        }
+        return Ok(Layout::new(task, usize::from(n_arms)).into());
+    }
+    if let Some(served) = served_task::of_server(&args.environment)? {
+        return Ok(served.task);
+    }
+    layout_of(actor, Role::Actor).map_err(|source| {
+        let failed = refused(&args.actor, source);
+        if names_task(actor) { failed } else { failed.context(UNKNOWN_TASK.to_owned()) }
+    })
 }
 
 /// Rejects two arguments that name one file: writing one would destroy the other.
-fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Failed> {
+pub(super) fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Failed> {
     let mut former: Vec<(&str, PathBuf)> = Vec::new();
     for (name, path) in files {
         let Some(path) = path else { continue };

@@ -6,6 +6,8 @@ use crate::cli::SymmetrizeArgs;
 use crate::exit::{Failed, OrExit as _};
 use crate::{output, policy_file};
 
+use super::onnx::check_distinct;
+
 pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
     let refusal = if policy.is_symmetrized() {
@@ -19,7 +21,12 @@ pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     if let Some(refusal) = refusal {
         return Err(Failed::usage(format!("{}: {refusal}", args.file.display())));
     }
-    let policy = policy.symmetrized();
+    check_distinct(&[("FILE", Some(args.file.as_path())), ("--out", Some(args.out.as_path()))])?;
+    let mut policy = policy.symmetrized();
+    // The evaluation was that of the policy before. Its seed remains: the goals chose this policy too.
+    policy
+        .metadata
+        .retain(|key, _| !key.starts_with("evaluation_success") && key != "evaluation_episodes");
     policy.save(&args.out).or_cannot_write(String::new)?;
     let (n_layers, n_hidden) = (policy.n_hidden_layers, policy.n_hidden);
     if args.json {

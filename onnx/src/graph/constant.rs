@@ -1,7 +1,7 @@
 //! Constant tensors.
 
 use crate::error::ModelError;
-use crate::onnx_proto::{EXTERNAL, FLOAT, TensorProto};
+use crate::onnx_proto::{BOOL, EXTERNAL, FLOAT, TensorProto};
 
 /// A constant tensor, possibly transposed. Its numbers are copied when a node uses them.
 #[derive(Debug, Clone, Copy)]
@@ -102,6 +102,14 @@ impl<'a> Constant<'a> {
             );
         }
         Ok(self.stored()[0])
+    }
+
+    /// Returns the only boolean.
+    pub(super) fn flag(&self) -> Result<bool, ModelError> {
+        match (self.tensor.data_type, self.tensor.raw_data.as_slice()) {
+            (BOOL, [flag]) => Ok(*flag != 0),
+            _ => Err(self.refused("expected one boolean, as raw data")),
+        }
     }
 
     fn numbers(&self) -> Result<Vec<f32>, ModelError> {

@@ -35,7 +35,15 @@ pub(super) fn interpret<'a>(
         "Clip" => clip(interpreter, node),
         "Relu" => activation(interpreter, node, Op::Relu),
         "Tanh" => activation(interpreter, node, Op::Tanh),
-        "Identity" | "Dropout" => value_of(interpreter, node, 0),
+        "Identity" => value_of(interpreter, node, 0),
+        "Dropout" => {
+            // Version 12 added the mode as input 3; the earlier ones never drop.
+            let trains = match constant_of(interpreter, node, 2)? {
+                Some(mode) => mode.flag()?,
+                None => false,
+            };
+            unchanged_if(interpreter, node, !trains, "inference (training_mode false)")
+        }
         "Flatten" => unchanged_if(interpreter, node, int(node, "axis", 1) == 1, "axis 1"),
         "Cast" => {
             let is_float = int(node, "to", 0) == i64::from(FLOAT);

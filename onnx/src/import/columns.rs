@@ -5,9 +5,11 @@ use tandem_policy::normalizer::CLIP;
 use crate::binding::Source;
 use crate::network::{Column, Op};
 
-/// Standard deviation of a column that is not clipped. Observations lie within ±1000, and 5 · 256 exceeds that; a power
-/// of two changes no digit of a weight.
+/// Smallest standard deviation of a column that is not clipped. A power of two changes no digit of a weight.
 const UNCLIPPED_STD: f32 = 256.0;
+/// Largest standard deviation of a column that is not clipped: ordinary numbers remain normal floats when they are
+/// divided by it.
+const MAX_UNCLIPPED_STD: f32 = (1_u128 << 90) as f32;
 
 /// A column as a multiple of a policy's normalised input: `factor * clip((x - mean) / std, -5, 5) + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,8 +43,13 @@ impl Affine {
     }
 }
 
-/// Brings the operations of a column to the form of a policy. The policy gives actions to its critic as they are.
-pub(super) fn normalized(source: Source, column: &Column) -> Result<Normalized, String> {
+/// Brings the operations of a column to the form of a policy. The policy gives actions to its critic as they are. The
+/// column's numbers are within ±`bound`.
+pub(super) fn normalized(
+    source: Source,
+    column: &Column,
+    bound: f32,
+) -> Result<Normalized, String> {
     let (mut before, mut after) = (Affine::IDENTITY, Affine::IDENTITY);
     let mut bounds: Option<[f32; 2]> = None;
     for op in &column.ops {
@@ -63,7 +70,11 @@ pub(super) fn normalized(source: Source, column: &Column) -> Result<Normalized, 
             }
         }
     }
-    let bounds = bounds.filter(|bounds| !is_idle(source, before, *bounds));
+    let is_action = matches!(source, Source::Action(_));
+    let bounds = bounds.filter(|bounds| {
+        let is_needed = !is_action && clipped_std(before, *bounds).is_some();
+        is_needed || !is_idle(before, *bounds, bound)
+    });
     match (source, bounds) {
         (Source::Action(_), None) => {
             let joined = joined(before, after);
@@ -72,7 +83,7 @@ pub(super) fn normalized(source: Source, column: &Column) -> Result<Normalized, 
         (Source::Action(_), Some(_)) => Err(format!("{} is clipped", name(source))),
         (_, None) => {
             let Affine { scale, shift } = joined(before, after);
-            let std = UNCLIPPED_STD;
+            let std = unclipped_std(bound);
             Ok(Normalized { mean: 0.0, std, factor: scale * f64::from(std), offset: shift })
         }
         (_, Some(bounds)) => clipped(source, before, bounds, after),
@@ -89,14 +100,28 @@ fn is_plain(affine: Affine) -> bool {
     affine.scale == 1.0 && affine.shift == 0.0
 }
 
-/// Returns true if no valid number reaches the bounds.
-fn is_idle(source: Source, before: Affine, [low, high]: [f32; 2]) -> bool {
-    let largest = match source {
-        Source::Action(_) => 1.0,
-        Source::Observation(_) | Source::Goal(_) => f64::from(CLIP * UNCLIPPED_STD),
-    };
-    let reach = (before.scale * largest).abs();
+/// Returns true if no number within ±`largest` reaches the bounds.
+fn is_idle(before: Affine, [low, high]: [f32; 2], largest: f32) -> bool {
+    let reach = (before.scale * f64::from(largest)).abs();
     f64::from(low) <= before.shift - reach && before.shift + reach <= f64::from(high)
+}
+
+/// Returns the standard deviation with which a policy clips at the bounds; negative if they are reversed. `None` if a
+/// policy cannot: a bound is infinite, or so large that it means none.
+fn clipped_std(before: Affine, [low, high]: [f32; 2]) -> Option<f64> {
+    let half = (f64::from(high) - f64::from(low)) / 2.0;
+    let std = half / f64::from(CLIP) / before.scale;
+    (half > 0.0 && std.abs() <= f64::from(MAX_UNCLIPPED_STD)).then_some(std)
+}
+
+/// Returns a standard deviation with which numbers within ±`bound` are not clipped: the smallest power of two from
+/// [`UNCLIPPED_STD`] on, but at most [`MAX_UNCLIPPED_STD`].
+fn unclipped_std(bound: f32) -> f32 {
+    let mut std = UNCLIPPED_STD;
+    while CLIP * std < bound && std < MAX_UNCLIPPED_STD {
+        std *= 2.0;
+    }
+    std
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "statistics are stored as f32")]
@@ -106,19 +131,16 @@ fn clipped(
     [low, high]: [f32; 2],
     after: Affine,
 ) -> Result<Normalized, String> {
-    let (low, high) = (f64::from(low), f64::from(high));
-    let half = (high - low) / 2.0;
-    if !half.is_finite() || half <= 0.0 || before.scale == 0.0 {
+    let Some(std) = clipped_std(before, [low, high]) else {
         return Err(format!(
             "{} is clipped to {low} to {high}, expected two finite bounds",
             name(source)
         ));
-    }
-    let centre = f64::midpoint(low, high);
+    };
+    let centre = f64::midpoint(f64::from(low), f64::from(high));
     // clip(z, low, high) = centre + half / 5 * clip((z - centre) * 5 / half, -5, 5)
-    let factor = half / f64::from(CLIP);
+    let factor = std * before.scale;
     let mean = (centre - before.shift) / before.scale;
-    let std = factor / before.scale;
     Ok(Normalized {
         mean: mean as f32,
         std: std.abs() as f32,

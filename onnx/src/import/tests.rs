@@ -52,6 +52,17 @@ fn a_model_of_a_task_that_is_not_built_in_describes_it() {
     let built_in = Model::decode(&export::actor(&shipped("teacher-push-classic")).unwrap());
     assert!(!built_in.unwrap().metadata.contains_key(metadata::TASK_DESCRIPTION));
 
+    let without = |key: &str| {
+        let mut actor = Model::decode(&export::actor(&shipped("teacher-push")).unwrap()).unwrap();
+        actor.metadata.remove(key);
+        layout(&actor).unwrap_err().to_string()
+    };
+    let missing = |present: &str, missing: &str| {
+        format!("metadata {present:?} is present, {missing:?} is missing")
+    };
+    assert_eq!(without(metadata::N_ARMS), missing(metadata::TASK, metadata::N_ARMS));
+    assert_eq!(without(metadata::TASK), missing(metadata::N_ARMS, metadata::TASK));
+
     for (text, problem) in [
         ("{}", "missing field"),
         (&json!(policy.layout.description()).to_string().replace("0.1", "-1.0"), "tolerance"),
@@ -182,6 +193,29 @@ fn other_clips_and_repeated_inputs_become_a_policys_normalisation() {
 }
 
 #[test]
+fn wide_clips_and_wide_observations_are_kept() {
+    let mut policy = shipped("teacher-push-classic");
+    policy.observation_normalizer.std[0] = 300.0;
+    let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
+    let critic = Model::decode(&export::critic(&policy).unwrap()).unwrap();
+    assert_eq!(import(&actor, Some(&critic), LAYOUT).unwrap().digest(), policy.digest());
+
+    let mut description = TaskDescription { name: "lab/mm".to_owned(), ..LAYOUT.description() };
+    description.observation_bound[0] = 5000.0;
+    description.observation_bound[1] = f32::MAX;
+    let layout = TaskSpec::new(description).unwrap();
+    let unclipped = model(&[("x", 31)], &[], steps(&[31, 8, 3], Some(Op::Tanh), 9));
+    let policy = import(&unclipped, None, &layout).unwrap();
+    let stds = &policy.observation_normalizer.std;
+    assert_eq!([stds[0], stds[2]], [1024.0, 256.0]);
+    assert!(0.01 / stds[1] > 1e-30, "{}: ordinary numbers remain normal floats", stds[1]);
+
+    let open = [Op::Clip(-1e38, f32::INFINITY)];
+    let open = model(&[("x", 31)], &open, steps(&[31, 8, 3], Some(Op::Tanh), 9));
+    assert_eq!(import(&open, None, LAYOUT).unwrap().observation_normalizer.std[0], 256.0);
+}
+
+#[test]
 fn an_uneven_clip_and_a_negative_scale_keep_their_values() {
     let ops = [Op::Mul(-2.0), Op::Clip(-1.0, f32::INFINITY), Op::Clip(f32::NEG_INFINITY, 4.0)];
     let actor = model(&[("x", 31)], &ops, steps(&[31, 8, 3], Some(Op::Tanh), 5));
@@ -226,6 +260,10 @@ fn networks_that_a_policy_file_cannot_represent_are_refused() {
     hidden[1] = Step::Each(vec![Op::Tanh; 8]);
     check(hidden, &[], "Tanh follows hidden layer 1, expected Relu (`tandem teacher` can serve");
     check(steps(&[31, 8, 3], None, 1), &[], "the actor does not end with Tanh");
+    let critic = model(&[("obs", 31), ("action", 3)], &[], steps(&[34, 8, 2], None, 1));
+    let actor = model(&[("x", 31)], &[], steps(&[31, 8, 3], tanh, 1));
+    let refusal = import(&actor, Some(&critic), LAYOUT).expect_err("refused").to_string();
+    assert!(refusal.contains("has 2 values, expected 1, or one for each of 1 arm"), "{refusal}");
     check(steps(&[31, 3], tanh, 1), &[], "it has no hidden layer");
     check(steps(&[31, 8, 3], tanh, 1), &[Op::Relu], "observation 0 is transformed by Relu");
     check(

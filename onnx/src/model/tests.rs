@@ -5,8 +5,8 @@ use prost::Message as _;
 use super::Model;
 use crate::network::{Op, Step};
 use crate::onnx_proto::{
-    AttributeProto, DimensionProto, FLOAT, GraphProto, ModelProto, NodeProto, OperatorSetIdProto,
-    TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
+    AttributeProto, BOOL, DimensionProto, FLOAT, GraphProto, ModelProto, NodeProto,
+    OperatorSetIdProto, TensorProto, TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
 };
 
 fn tensor(name: &str, dims: &[i64], numbers: &[f32]) -> TensorProto {
@@ -58,6 +58,8 @@ fn model(nodes: &[&str]) -> ModelProto {
         tensor("minus", &[1], &[-1.0]),
         tensor("nan", &[2], &[f32::NAN, 1.0]),
         TensorProto { data_type: 11, ..tensor("double", &[2], &[]) },
+        TensorProto { data_type: BOOL, raw_data: vec![0], ..tensor("false", &[], &[]) },
+        TensorProto { data_type: BOOL, raw_data: vec![1], ..tensor("true", &[], &[]) },
         TensorProto { data_location: 1, ..tensor("elsewhere", &[2, 3], &[]) },
         tensor("short", &[2, 3], &[1.0]),
     ];
@@ -130,6 +132,10 @@ fn a_refusal_names_the_node_its_operator_and_what_is_supported() {
     check(&["MatMul a w4 -> y"], "(MatMul): its rows have 2 numbers, its weight takes 4");
     check(&["MatMul a b -> y"], "(MatMul): input 2 must be a constant");
     check(&["Gemm a w c3 transA=1 -> y"], "transA is not supported");
+    check(
+        &["Dropout a one true -> x", "MatMul x w -> y"],
+        "(Dropout): only inference (training_mode false) is supported",
+    );
     check(&["MatMul a w -> h", "Add h h -> y"], "(Add): one of its inputs must be a constant");
     check(&["Div a zeros -> x", "MatMul x w -> y"], "(Div): it divides by 0");
     check(&["Div c2 a -> x", "MatMul x w -> y"], "a constant divided by rows");
@@ -165,8 +171,8 @@ fn models_of_other_kinds_are_refused() {
         "it has 2 outputs, expected one, or one named action, actions, value, values, q, output";
     check(|model| model.graph.as_mut().unwrap().output.push(value("z", 1)), outputs);
     check(
-        |model| model.graph.as_mut().unwrap().input[0] = value("a", 4096),
-        "input \"a\": expected shape [batch, n] with n from 1 to 1024",
+        |model| model.graph.as_mut().unwrap().input[0] = value("a", 12_289),
+        "input \"a\": expected shape [batch, n] with n from 1 to 12288",
     );
     check(
         |model| model.graph.as_mut().unwrap().input[1].r#type = None,

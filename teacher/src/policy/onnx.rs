@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use tandem_core::TaskSpec;
-use tandem_onnx::binding::layout_of;
+use tandem_onnx::binding::{check_pair, layout_of};
 use tandem_onnx::{BoundNetwork, Error as OnnxError, Model, ModelError, Role};
 
 use super::TeacherPolicy;
@@ -25,7 +25,8 @@ impl OnnxPolicy {
     /// The task is the one in the actor's metadata, or the one that its inputs and outputs fit.
     ///
     /// # Errors
-    /// When a file cannot be read, its graph is not supported, or the models are not for one arm and the same task.
+    /// When a file cannot be read, its graph is not supported, the models are not for one arm and the same task, or their
+    /// metadata says that they are parts of different policies.
     pub fn load(actor: &Path, critic: Option<&Path>) -> Result<Self, Error> {
         let model = Model::load(actor)?;
         let layout = layout_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;
@@ -36,6 +37,8 @@ impl OnnxPolicy {
             return Self::new(bound, None, model.digest, values);
         };
         let critic_model = Model::load(path)?;
+        let checked = check_pair(&model, &critic_model);
+        checked.map_err(|source| refused(path, source))?;
         let critic = BoundNetwork::new(&critic_model, Role::Critic, layout);
         let critic = critic.map_err(|source| refused(path, source))?;
         let n_values = critic.network().n_output;
@@ -157,6 +160,20 @@ mod tests {
             refusal(&policy_file("teacher-push-classic.safetensors"), Some(&critic)),
             "a critic is given apart only for an ONNX model: a policy file contains its own"
         );
+        let other = tempfile::tempdir().unwrap();
+        let [shared, shared_critic] = exported(other.path(), "teacher-push.safetensors");
+        let mixed = refusal(&shared, Some(&critic));
+        assert!(
+            mixed.ends_with(
+                "its metadata says push with 2 arms, the actor's says shared-push with 1 arm"
+            ),
+            "{mixed}"
+        );
+        let mut policy = Policy::load(&policy_file("teacher-push.safetensors")).unwrap();
+        policy.critic[0] += 1.0;
+        std::fs::write(&shared_critic, tandem_onnx::export::critic(&policy).unwrap()).unwrap();
+        let mixed = refusal(&shared, Some(&shared_critic));
+        assert!(mixed.contains("it belongs to another policy than the actor"), "{mixed}");
         let swapped = refusal(&critic, Some(&actor));
         assert!(
             swapped.contains("critic.onnx\" is not a usable ONNX model: output \"value\""),
