@@ -9,6 +9,8 @@ use super::*;
 use crate::config::Recipe;
 use crate::replay::fixtures::drifting_episode;
 
+mod learn;
+
 #[test]
 fn a_statistic_ruined_by_one_implausible_number_is_named() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
@@ -77,14 +79,6 @@ fn without_a_horizon_the_student_asks_on_all_steps_and_at_horizon_zero_on_none()
     jump_start.finish_round(32, 32);
     jump_start.finish_round(32, 32);
     assert!(orders(&trainer).iter().all(|order| !order.advised), "no leases, no queries");
-}
-
-#[test]
-fn intervention_feedback_lowers_the_lowest_value() {
-    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
-    assert_eq!(config.advice.intervention_cost(), 0.0);
-    "rlif:0.2".clone_into(&mut config.advice.strategy);
-    assert_eq!((config.advice.intervention_cost(), config.advice.horizon()), (1.0, None));
 }
 
 #[test]
