@@ -130,14 +130,14 @@ impl ChildProcess {
         Ok(lines)
     }
 
-    /// Asks the process to exit and waits for it; kills it after `deadline`. Returns whether it exited by itself.
-    pub(crate) async fn end(mut self, deadline: Duration) -> bool {
+    /// Asks the process to exit and waits for it; kills it after `deadline`. Returns how it ended by itself.
+    pub(crate) async fn end(mut self, deadline: Duration) -> Option<ProcessEnd> {
         drop(self.take_input());
-        let exits = tokio::time::timeout(deadline, self.child.wait()).await.is_ok();
-        if !exits {
+        let ended = tokio::time::timeout(deadline, self.child.wait()).await;
+        if ended.is_err() {
             drop(self.child.kill().await);
         }
-        exits
+        ended.ok()?.ok().map(ProcessEnd::from)
     }
 }
 

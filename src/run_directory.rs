@@ -13,9 +13,19 @@ pub(crate) const RUNS: &str = "runs";
 /// Runs that a message names.
 const MAX_NAMED_RUNS: usize = 5;
 
+/// Returns the directory of a run's checkpoints.
+pub(crate) fn checkpoints(out: &Path) -> PathBuf {
+    out.join("checkpoint")
+}
+
+/// Returns the file of a run's advice accounts.
+pub(crate) fn ledger(out: &Path) -> PathBuf {
+    out.join("ledger.sqlite")
+}
+
 /// Returns the round of the newest checkpoint of the run in `out`, if there is one.
 pub(crate) fn saved_round(out: &Path) -> Option<u64> {
-    let checkpoints = tandem_learner::checkpoint::list(&out.join("checkpoint"));
+    let checkpoints = tandem_learner::checkpoint::list(&checkpoints(out));
     checkpoints.last()?.file_stem()?.to_str()?.parse().ok()
 }
 
@@ -48,7 +58,7 @@ pub(crate) fn no_run(problem: &str) -> Failed {
 }
 
 /// Returns the directories in `parent` that hold runs, in the order of their names.
-fn runs_in(parent: &Path) -> Vec<PathBuf> {
+pub(crate) fn runs_in(parent: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(parent).into_iter().flatten();
     let directories = entries.filter_map(|entry| Some(entry.ok()?.path()));
     let mut runs: Vec<PathBuf> =

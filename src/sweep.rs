@@ -8,6 +8,7 @@ mod display;
 mod run_process;
 mod run_status;
 mod sweep_file;
+mod teachers;
 
 use std::collections::VecDeque;
 use std::fs::{File, TryLockError};
@@ -48,6 +49,9 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         Some(only) => vec![selected(runs, only)?],
         None => runs,
     };
+    if out.join("run.toml").exists() {
+        return Err(Failed::usage(format!("{} holds a run: choose another --out", out.display())));
+    }
     let lock = match args.dry_run {
         true => None,
         false => Some(lock(&out, args.only.is_some()).or_cannot_write(String::new)?),
@@ -61,12 +65,18 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         }
     }
     refuse(&refused, &out)?;
+    let checked = teachers::check(&statuses);
     if args.dry_run {
+        // The teachers may be trained later.
+        if let Err(failed) = checked {
+            output::message(failed.line());
+        }
         return print_plan(&statuses, &out, args.json);
     }
+    checked?;
     let address = dashboard::address(&args.dashboard)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
-    let is_complete = runtime.block_on(async {
+    let end = runtime.block_on(async {
         let interrupted = signals::shutdown_token(false)?;
         let n_jobs = usize::from(args.jobs);
         let mut sweep = Sweep::new(statuses.as_mut_slice(), n_jobs, &environment);
@@ -74,15 +84,15 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
             Some(address) => sweep.serve(args, &out, address).await?,
             None => None,
         };
-        let is_complete = sweep.run(&interrupted).await;
+        let end = sweep.run(&interrupted).await;
         if served.is_some() {
             tokio::time::sleep(FAREWELL).await;
         }
-        is_complete
+        end
     })?;
     drop(lock);
-    if !is_complete {
-        print_resume_command(args, &out);
+    if end != SweepEnd::Complete {
+        print_resume_command(args, &out, end);
         return Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")));
     }
     print_result(&statuses, &out, args.json)
@@ -137,6 +147,17 @@ fn refuse(refused: &[String], out: &Path) -> Result<(), Failed> {
         "{named}{more}: choose another --out than {}, or undo the change (a larger stop.max_env_steps extends runs)",
         out.display()
     )))
+}
+
+/// How a sweep ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum SweepEnd {
+    /// Every run has ended.
+    Complete,
+    /// It was interrupted, and the runs have saved and exited.
+    Saved,
+    /// It was interrupted again while runs were saving.
+    Saving,
 }
 
 /// A running sweep.
@@ -210,8 +231,8 @@ impl<'a> Sweep<'a> {
         Ok(Some(stop.drop_guard()))
     }
 
-    /// Trains every unfinished run. Returns whether all of them have ended.
-    async fn run(mut self, interrupted: &CancellationToken) -> Result<bool, Failed> {
+    /// Trains every unfinished run, until all of them have ended or `interrupted` is cancelled.
+    async fn run(mut self, interrupted: &CancellationToken) -> Result<SweepEnd, Failed> {
         let mut running: JoinSet<(usize, RunOutcome)> = JoinSet::new();
         let mut refresh = tokio::time::interval(REFRESH_EVERY);
         loop {
@@ -244,7 +265,7 @@ impl<'a> Sweep<'a> {
             0 => self.end("complete"),
             n_failed => self.end(&format!("{n_failed} of {} runs failed", self.statuses.len())),
         }
-        Ok(true)
+        Ok(SweepEnd::Complete)
     }
 
     /// Shows the end of the sweep on the dashboard.
@@ -255,23 +276,25 @@ impl<'a> Sweep<'a> {
     }
 
     /// Waits until the running runs have saved. A second interruption ends them at once.
-    async fn save(mut self, mut running: JoinSet<(usize, RunOutcome)>) -> Result<bool, Failed> {
+    async fn save(mut self, mut running: JoinSet<(usize, RunOutcome)>) -> Result<SweepEnd, Failed> {
         self.display.print("interrupted: saving, a second Ctrl-C ends at once");
         let interrupted_again = signals::shutdown_token(false)?;
-        loop {
+        let end = loop {
             tokio::select! {
                 joined = running.join_next() => match joined {
                     Some(joined) => {
                         let (idx, outcome) = joined.or_exit(Exit::Bug, String::new)?;
                         self.handle_outcome(idx, outcome)?;
                     }
-                    None => break,
+                    None => break SweepEnd::Saved,
                 },
-                () = interrupted_again.cancelled() => break,
+                () = interrupted_again.cancelled() => break SweepEnd::Saving,
             }
-        }
+        };
         self.end("interrupted");
-        Ok(self.statuses.iter().all(|status| matches!(status.state, State::Finished(_))))
+        let is_complete =
+            self.statuses.iter().all(|status| matches!(status.state, State::Finished(_)));
+        Ok(if is_complete { SweepEnd::Complete } else { end })
     }
 
     fn start(
@@ -289,7 +312,7 @@ impl<'a> Sweep<'a> {
             }
         };
         self.statuses[idx].begin();
-        self.display.started(&run.name, run.log_path());
+        self.display.started(run.name(), run.log_path());
         let (sender, progress) = watch::channel(Value::Null);
         if let Some(board) = &mut self.board {
             board.started(idx, progress);
@@ -322,7 +345,7 @@ impl<'a> Sweep<'a> {
                     self.display.print(&format!("{name}: the cause is not saved: {error:#}"));
                 }
             }
-            RunOutcome::Interrupted => self.display.print(&format!("{name}: saved")),
+            RunOutcome::Interrupted => self.display.print(&format!("{name}: interrupted")),
         }
         if let Some(board) = &mut self.board {
             board.ended(idx, &self.statuses[idx]);
@@ -399,13 +422,18 @@ fn failures(statuses: &[RunStatus]) -> Result<(), Failed> {
     Err(Failed::new(Exit::TryAgain, error))
 }
 
-fn print_resume_command(args: &SweepArgs, out: &Path) {
+fn print_resume_command(args: &SweepArgs, out: &Path, end: SweepEnd) {
     let options = match args.only {
         Some(only) => format!(" --only {only}"),
         None if args.jobs > 1 => format!(" --jobs {}", args.jobs),
         None => String::new(),
     };
-    output::message("interrupted; the state is saved. Resume with:");
+    output::message(match end {
+        SweepEnd::Saving => {
+            "interrupted; runs may still be saving, which the next start waits for. Resume with:"
+        }
+        SweepEnd::Complete | SweepEnd::Saved => "interrupted; the state is saved. Resume with:",
+    });
     output::message(format_args!(
         "  tandem sweep {} --out {}{options}",
         shell_word(&args.file),

@@ -8,9 +8,9 @@ mod policy_server;
 mod processes;
 mod progress_stream;
 mod restart_policy;
-mod run_lock;
+pub(crate) mod run_lock;
 mod summary;
-mod teacher_file;
+pub(crate) mod teacher_file;
 
 use std::time::{Duration, Instant};
 
@@ -28,11 +28,12 @@ use crate::progress_json::progress_json;
 use crate::run_display::Display;
 use crate::shell::shell_word;
 use crate::{
-    clock, environment_server, metrics, output, runtime, served_task, settings_page, signals,
+    clock, environment_server, metrics, output, run_directory, runtime, served_task, settings_page,
+    signals,
 };
 use inputs::RunInputs;
 use plan::Plan;
-use processes::{PeakMemory, RunFailure, RunProcesses};
+use processes::{PeakMemory, RunFailure, RunProcesses, Saved};
 use progress_stream::ProgressUpdate;
 use run_lock::RunLock;
 
@@ -62,6 +63,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     let live = args.live.live.map(|address| LiveRun::start(address, plan.logs())).transpose()?;
     let lock = RunLock::take(&plan)?;
     let service_locks = lock.wait_for_leftovers(&plan)?;
+    let former_round = run_directory::saved_round(&plan.out);
     plan.prepare()?;
     let inputs = RunInputs::write(&plan, &lock)?;
     drop(service_locks);
@@ -71,9 +73,24 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         run((&plan, &lock), &interrupted, args).await
     })?;
     drop((inputs, live));
+    if last.end_reason == INTERRUPTED && !lock.is_in_place() {
+        let out = plan.out.display();
+        return Err(Failed::new(
+            Exit::TryAgain,
+            anyhow!(
+                "interrupted, and {out} was moved, removed or replaced: resume the run at its new path"
+            ),
+        ));
+    }
     if last.end_reason == INTERRUPTED {
         summary::print_interrupted(&plan);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
+    }
+    if former_round == Some(last.round) {
+        output::message(format_args!(
+            "nothing was trained: {}; a larger --max-env-steps or --max-minutes continues the run, 0 removes a limit",
+            last.end_reason
+        ));
     }
     summary::print(&plan, &last, memory, args)
 }
@@ -104,15 +121,22 @@ async fn run(
         display.print("interrupted: saving, a second Ctrl-C ends at once");
     }
     let interrupted_again = signals::shutdown_token(false)?;
-    tokio::select! {
-        is_saved = processes.end(END_TIMEOUT) => if !is_saved {
-            display.print(NOT_SAVED);
-        },
-        () = interrupted_again.cancelled() => (),
+    let saved = tokio::select! {
+        saved = processes.end(END_TIMEOUT) => saved,
+        () = interrupted_again.cancelled() => Saved::Yes,
+    };
+    if saved == Saved::TooLate {
+        display.print(NOT_SAVED);
     }
     let last = last.map_err(|RunFailure { exit, error }| {
         Failed::new(exit, error.context(failure_context(plan, exit)))
     })?;
+    if interrupted.is_cancelled()
+        && let Saved::Failed(why) = saved
+    {
+        let exit = Exit::TryAgain;
+        return Err(Failed::new(exit, anyhow!(why)).context(failure_context(plan, exit)));
+    }
     if last.ended && !interrupted.is_cancelled() {
         return Ok((last, processes.peak_memory()));
     }

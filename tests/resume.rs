@@ -228,7 +228,11 @@ fn a_finished_run_can_be_extended() {
     assert!(summary.contains("\"env_steps\":5600,"), "{summary}");
     let settings = fs::read_to_string(out.join("run.toml")).expect("readable");
     assert!(settings.contains("max_env_steps = 5600"), "{settings}");
-    assert_eq!(digest(&resume(&out, &[])), digest(&longer), "the extension is kept");
+    let again = resume(&out, &[]);
+    assert_eq!(digest(&again), digest(&longer), "the extension is kept");
+    let remark = "nothing was trained: 5600 environment steps reached; a larger --max-env-steps";
+    assert!(stderr(&again).contains(remark), "{}", stderr(&again));
+    assert!(!stderr(&longer).contains("nothing was trained"), "{}", stderr(&longer));
 }
 
 #[test]
@@ -267,6 +271,33 @@ fn a_run_goes_on_with_its_own_program_after_another_has_taken_its_place() {
     fs::write(&program, "not a program").expect("writable");
     kill_one(&run, "worker");
     assert_eq!(digest(&run.wait_with_output().expect("ends")), UNDISTURBED.1);
+}
+
+#[test]
+fn an_interrupted_run_whose_directory_was_moved_says_so() {
+    let (keep, out) = directory();
+    let run = start(&out);
+    wait_for_checkpoint(&out);
+    fs::rename(&out, keep.path().join("moved")).expect("moves");
+    signal("-INT", run.id());
+    let ended = run.wait_with_output().expect("ends");
+    let message = stderr(&ended);
+    assert_eq!(ended.status.code(), Some(75), "{message}");
+    let line = message.lines().last().unwrap_or_default();
+    let is_named = line.contains("was moved, removed or replaced") || line.contains("the learner");
+    assert!(is_named && !message.contains("is saved"), "{message}");
+}
+
+#[test]
+fn a_new_run_is_not_put_among_other_runs() {
+    let (keep, out) = finished();
+    let refused = tandem(&["train"], keep.path()).output().expect("runs");
+    check_refused(&refused, 64, "holds other runs, such as");
+    let sweep = keep.path().join("sweep.toml");
+    fs::write(&sweep, "seeds = [1]\n[run]\nstop.max_env_steps = 800\n").expect("writes");
+    let sweep = sweep.to_str().expect("UTF-8");
+    let refused = tandem(&["sweep", sweep], &out).output().expect("runs");
+    check_refused(&refused, 64, "holds a run: choose another --out");
 }
 
 #[test]

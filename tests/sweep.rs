@@ -1,7 +1,7 @@
 //! A sweep of real runs that is interrupted, killed and restarted, and the report on it.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, SystemTime};
 
@@ -225,8 +225,11 @@ fn report_has_every_run(out: &Path, directory: &Path) {
 fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     let keep = tempfile::tempdir().expect("a directory");
     let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
-    let teacher: PathBuf = keep.path().join("teacher.safetensors");
-    let lists = format!("strategies = [\"none\", \"ea\"]\n[teachers]\nshared-push = {teacher:?}");
+    let lists = "strategies = [\"none\", \"ea\"]\n";
+    // A file is where a directory of the run belongs.
+    let blocked = out.join("shared-push-ea-seed1/policy");
+    fs::create_dir_all(blocked.parent().expect("a parent")).expect("creates");
+    fs::write(&blocked, "").expect("writes");
     let shorter =
         SMALL.map(|(key, value)| (key, if key == "stop.max_env_steps" { "1600" } else { value }));
     let settings: String =
@@ -237,20 +240,96 @@ fn a_failed_run_is_reported_and_retried_at_the_next_start() {
     let message = text(&failed.stderr);
     assert_eq!(failed.status.code(), Some(75), "{message}");
     assert!(
-        message.contains("shared-push-ea-seed1: failed:")
-            && message.contains("teacher.safetensors"),
+        message.contains("shared-push-ea-seed1: failed:") && message.contains("cannot write to"),
         "{message}"
     );
     assert!(message.contains("1 of 2 runs failed"), "{message}");
     assert!(text(&failed.stdout).contains("1 of 2"), "{}", text(&failed.stdout));
 
-    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies/teacher-push.safetensors");
-    fs::copy(shipped, &teacher).expect("copies");
+    fs::remove_file(&blocked).expect("removes");
     let again = sweep(&file, &out, &["--json"]).output().expect("runs");
     assert!(text(&again.stderr).contains("failed before"), "{}", text(&again.stderr));
     let result = last_object(&again);
     assert_eq!(result["finished"], 2, "{result}");
     assert!(result["runs"][1]["failure"].is_null(), "{result}");
+}
+
+#[test]
+fn a_run_whose_directory_cannot_be_created_counts_as_failed() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    write_sweep(&file, "seeds = [1]", &[]);
+    fs::create_dir(&out).expect("creates");
+    fs::write(out.join("shared-push-mc-q-0.1-seed1"), "").expect("writes");
+    let failed = sweep(&file, &out, &["--json"]).output().expect("runs");
+    let message = text(&failed.stderr);
+    assert_eq!(failed.status.code(), Some(75), "{message}");
+    assert!(message.contains("1 of 1 runs failed") && message.contains("not saved"), "{message}");
+    let result: Value = serde_json::from_slice(&failed.stdout).expect("JSON");
+    assert!(result["runs"][0]["failure"].is_string(), "{result}");
+}
+
+#[test]
+fn a_teacher_that_cannot_advise_is_refused_before_any_run() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (teacher, reason) in [
+        (keep.path().join("none.safetensors"), "cannot read policy file"),
+        (root.join("policies/student-push.safetensors"), "drives 2 arms"),
+    ] {
+        let lists =
+            format!("strategies = [\"none\", \"ea\"]\n[teachers]\nshared-push = {teacher:?}");
+        write_sweep(&file, &lists, &[]);
+        let refused = sweep(&file, &out, &[]).output().expect("runs");
+        let message = text(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(64), "{message}");
+        assert!(message.contains("the teacher of shared-push-ea-seed1: "), "{message}");
+        assert!(message.contains(reason) && message.lines().count() == 1, "{message}");
+        assert!(!out.join("shared-push-none-seed1").exists(), "no run has started");
+        let plan = sweep(&file, &out, &["--dry-run"]).output().expect("lists");
+        assert!(plan.status.success() && text(&plan.stderr).contains(reason));
+    }
+}
+
+/// A run that has learned nothing may be started anew with other settings, but not while its processes use the directory.
+#[test]
+fn a_run_that_another_process_uses_is_left_alone() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    write_sweep(&file, "strategies = [\"none\"]", &[]);
+    let run = out.join("shared-push-none-seed1");
+    fs::create_dir_all(run.join("checkpoint")).expect("creates");
+    for name in ["run.toml", "ledger.sqlite"] {
+        fs::write(run.join(name), "").expect("writes");
+    }
+    fs::write(run.join("run.toml"), "seed = 7\n").expect("writes");
+    let used = tandem_system::DirectoryLock::try_take(&run.join("checkpoint"));
+    let used = used.expect("locks").expect("free");
+    let waiting = sweep(&file, &out, &["--no-dashboard"]).spawn().expect("starts");
+    eventually("the run's log", || run.join("sweep.log").exists());
+    std::thread::sleep(Duration::from_secs(1));
+    signal("-INT", waiting.id());
+    let ended = waiting.wait_with_output().expect("ends");
+    assert_eq!(ended.status.code(), Some(130), "{}", text(&ended.stderr));
+    assert!(run.join("run.toml").exists() && run.join("ledger.sqlite").exists());
+    drop(used);
+    let trained = sweep(&file, &out, &["--json", "--no-dashboard"]).output().expect("runs");
+    assert_eq!(last_object(&trained)["finished"], 1);
+    assert!(!run.join("ledger.sqlite").exists(), "the former ledger is gone");
+}
+
+/// The second of two commands waits for the run, and finds it complete.
+#[test]
+fn two_commands_train_one_run_once() {
+    let keep = tempfile::tempdir().expect("a directory");
+    let (file, out) = (keep.path().join("sweep.toml"), keep.path().join("sweep"));
+    write_sweep(&file, "strategies = [\"none\"]", &[]);
+    let only = || sweep(&file, &out, &["--json", "--only", "0", "--no-dashboard"]);
+    let both = [(); 2].map(|()| only().spawn().expect("starts"));
+    let results = both.map(|one| last_object(&one.wait_with_output().expect("ends")));
+    assert_eq!(results[0], results[1]);
+    assert!(!out.join("shared-push-none-seed1/failure.txt").exists());
 }
 
 /// `--only` trains one run of the list, at the same time as others in the same directory.

@@ -83,10 +83,10 @@ pub(crate) struct TrainArgs {
     /// Stops when an evaluation reaches this success rate, 0 to 1.
     #[arg(long, value_name = "P")]
     pub(crate) until_success: Option<f64>,
-    /// Stops after this many environment steps; 0 for no limit [default: the recipe's].
+    /// Stops after this many environment steps; 0 for no limit [default: the recipe's, none with --max-minutes].
     #[arg(long, value_name = "N")]
     pub(crate) max_env_steps: Option<u64>,
-    /// Stops after this many minutes instead; 0 for no limit.
+    /// Stops after this many minutes, those before --resume included; 0 for no limit. A resumed run keeps its other limit.
     #[arg(long, value_name = "N")]
     pub(crate) max_minutes: Option<f64>,
     /// Recipe that gives the defaults of all settings [default: tandem].

@@ -1,7 +1,8 @@
 //! One run of the sweep: a `tandem train` process.
 //!
 //! The run saves and exits when the sweep closes its standard input or dies. Its lines go to `sweep.log` in the run
-//! directory, which stays locked as long as a process has it open, so a run that is still saving is not started again.
+//! directory, which stays locked as long as a process has it open. A run is started again once this log and the locks of
+//! `tandem train`, the learner and the teacher are free.
 
 use std::ffi::OsString;
 use std::fs::TryLockError;
@@ -17,10 +18,13 @@ use tokio::process::ChildStdout;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::run_status::{RunStatus, State};
+use super::run_status::{self, RunStatus, State};
+use super::sweep_file::PlannedRun;
 use crate::cli::EnvironmentArgs;
+use crate::exit::Failed;
 use crate::launch::{Launcher, ProcessLog, last_line};
-use crate::{environment_server, run_file};
+use crate::train::run_lock;
+use crate::{environment_server, run_directory, run_file};
 
 /// Time that a run has to save and exit.
 const END_TIMEOUT: Duration = Duration::from_mins(11);
@@ -30,8 +34,9 @@ const RETRY_EVERY: Duration = Duration::from_millis(100);
 /// A run that can be started.
 #[derive(Debug)]
 pub(super) struct RunProcess {
-    pub(super) name: String,
+    run: PlannedRun,
     dir: PathBuf,
+    /// Arguments that do not depend on how far the run is.
     args: Vec<OsString>,
 }
 
@@ -55,7 +60,7 @@ impl RunProcess {
         n_workers: Option<usize>,
         has_dashboard: bool,
     ) -> anyhow::Result<Self> {
-        let RunStatus { run, dir, state, extends_to, .. } = status;
+        let RunStatus { run, dir, .. } = status;
         std::fs::create_dir_all(dir).with_context(|| format!("cannot create {}", dir.display()))?;
         let mut args: Vec<OsString> = vec![
             "train".into(),
@@ -68,22 +73,16 @@ impl RunProcess {
         if !has_dashboard {
             args.push("--no-dashboard".into());
         }
-        if *state == State::Started {
-            args.push("--resume".into());
-            if let Some(env_steps) = extends_to {
-                args.extend(["--max-env-steps".into(), env_steps.to_string().into()]);
-            }
-        } else {
-            args.extend(["--run".into(), write_run_file(status)?.into()]);
-        }
-        if let Some(teacher) = run.teacher.as_ref().filter(|_| *state != State::Started) {
-            args.extend(["--teacher".into(), teacher.into()]);
-        }
         if let Some(n_workers) = n_workers {
             args.extend(["--workers".into(), n_workers.to_string().into()]);
         }
         args.extend(environment_server::arguments(environment));
-        Ok(Self { name: run.name.clone(), dir: dir.clone(), args })
+        Ok(Self { run: run.clone(), dir: dir.clone(), args })
+    }
+
+    /// Returns the name of the run.
+    pub(super) fn name(&self) -> &str {
+        &self.run.name
     }
 
     /// Runs to the end, or until `stop` asks the run to save and exit. Messages about the progress go to `progress`.
@@ -104,12 +103,23 @@ impl RunProcess {
         progress: &watch::Sender<Value>,
     ) -> anyhow::Result<RunOutcome> {
         let log = ProcessLog::open(&self.log_path())?;
-        if !lock(&log, &self.dir, stop).await? {
+        let locked = retry(&self.dir, stop, || lock(&log)).await?;
+        let unused =
+            retry(&self.dir, stop, || run_lock::unused(&self.dir).map_err(Failed::into_error));
+        let (Some(()), Some(unused)) = (locked, unused.await?) else {
             return Ok(RunOutcome::Interrupted);
+        };
+        // The processes of another sweep may have changed the run while this one waited for them.
+        let mut args = self.args.clone();
+        match run_status::state(&self.run, &self.dir)? {
+            (State::Finished(summary), _) => return Ok(RunOutcome::Complete(summary)),
+            (State::Started, extends_to) => args.extend(resume_arguments(extends_to)),
+            (State::New, _) => args.extend(self.start_arguments()?),
         }
+        drop(unused);
         let launcher = Launcher::new(log)?;
         let mut child =
-            launcher.spawn(&self.args, Stdio::piped()).context("cannot start tandem train")?;
+            launcher.spawn(&args, Stdio::piped()).context("cannot start tandem train")?;
         let log_offset = child.log_offset();
         let stdin = child.take_input();
         let stdout = child.take_output()?;
@@ -133,6 +143,34 @@ impl RunProcess {
         let status = status.context("the run did not exit in time and is killed")?;
         let log = launcher.log();
         Ok(outcome(status, &last_line, || last_log_line(log, log_offset), stop))
+    }
+
+    /// Writes the run file of a new run, and returns the arguments that start it.
+    fn start_arguments(&self) -> anyhow::Result<Vec<OsString>> {
+        let mut args = vec!["--run".into(), self.write_run_file()?.into()];
+        args.extend(self.run.teacher.iter().flat_map(|path| ["--teacher".into(), path.into()]));
+        Ok(args)
+    }
+
+    /// Writes the resolved settings of a new run next to the run file of `tandem train`.
+    fn write_run_file(&self) -> anyhow::Result<PathBuf> {
+        let path = self.dir.join("sweep.toml");
+        let leftover = self.dir.join("run.toml");
+        if leftover.exists() {
+            // A run of `State::New` has learned nothing, so its run file can be replaced.
+            std::fs::remove_file(&leftover)
+                .with_context(|| format!("cannot remove {}", leftover.display()))?;
+            // The verdicts of its teacher are those of other settings.
+            let ledger = run_directory::ledger(&self.dir);
+            for suffix in ["", "-wal", "-shm"] {
+                let mut path = ledger.clone().into_os_string();
+                path.push(suffix);
+                drop(std::fs::remove_file(path));
+            }
+        }
+        let text = run_file::to_toml(&self.run.config)?;
+        std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        Ok(path)
     }
 
     /// Returns the path of the run's log.
@@ -178,42 +216,43 @@ fn outcome(
     }
 }
 
-/// Writes the resolved settings of a new run next to the run file of `tandem train`.
-fn write_run_file(status: &RunStatus) -> anyhow::Result<PathBuf> {
-    let path = status.dir.join("sweep.toml");
-    let leftover = status.dir.join("run.toml");
-    if leftover.exists() {
-        // A run of `State::New` has learned nothing, so its run file can be replaced.
-        std::fs::remove_file(&leftover)
-            .with_context(|| format!("cannot remove {}", leftover.display()))?;
-        // The verdicts of its teacher are those of other settings.
-        for name in ["ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm"] {
-            drop(std::fs::remove_file(status.dir.join(name)));
-        }
-    }
-    let text = run_file::to_toml(&status.run.config)?;
-    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
-    Ok(path)
+/// Returns the arguments that continue a run, to the length `extends_to` if it is longer than before.
+fn resume_arguments(extends_to: Option<u64>) -> Vec<OsString> {
+    let mut args = vec!["--resume".into()];
+    let length = |env_steps: u64| ["--max-env-steps".into(), env_steps.to_string().into()];
+    args.extend(extends_to.into_iter().flat_map(length));
+    args
 }
 
-/// Locks the log of the run in `dir`. Returns `false` if `stop` is cancelled first.
-async fn lock(log: &ProcessLog, dir: &Path, stop: &CancellationToken) -> anyhow::Result<bool> {
+/// Locks a log; `None` while another process has locked it.
+fn lock(log: &ProcessLog) -> anyhow::Result<Option<()>> {
+    match log.file().try_lock() {
+        Ok(()) => Ok(Some(())),
+        Err(TryLockError::WouldBlock) => Ok(None),
+        Err(TryLockError::Error(error)) => {
+            Err(error).with_context(|| format!("cannot lock {}", log.path().display()))
+        }
+    }
+}
+
+/// Repeats `take` until it returns a value, as long as a process that uses `dir` may take to save and exit. Returns `None` if
+/// `stop` is cancelled first.
+async fn retry<T>(
+    dir: &Path,
+    stop: &CancellationToken,
+    mut take: impl FnMut() -> anyhow::Result<Option<T>>,
+) -> anyhow::Result<Option<T>> {
     let n_attempts = END_TIMEOUT.as_millis() / RETRY_EVERY.as_millis();
     for _ in 0..n_attempts {
-        match log.file().try_lock() {
-            Ok(()) => return Ok(true),
-            Err(TryLockError::WouldBlock) => {}
-            Err(TryLockError::Error(error)) => {
-                let path = log.path().display();
-                return Err(error).with_context(|| format!("cannot lock {path}"));
-            }
+        if let Some(taken) = take()? {
+            return Ok(Some(taken));
         }
         tokio::select! {
             () = tokio::time::sleep(RETRY_EVERY) => {}
-            () = stop.cancelled() => return Ok(false),
+            () = stop.cancelled() => return Ok(None),
         }
     }
-    bail!("a run of an earlier sweep still uses {}", dir.display())
+    bail!("another process still uses {}", dir.display())
 }
 
 /// Returns the last line of the log since it had `offset` bytes.

@@ -6,13 +6,13 @@ use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
 use tandem_learner::checkpoint;
 use tandem_rl::RunConfig;
-use tandem_system::regular_file;
+use tandem_system::{atomic_file, regular_file};
 use tandem_teacher::policy::is_onnx;
 use toml::{Table, Value};
 
 use super::sweep_file::{PlannedRun, flattened};
 use crate::exit::Failed;
-use crate::run_file;
+use crate::{run_directory, run_file};
 
 /// A run and its status.
 #[derive(Debug)]
@@ -73,12 +73,12 @@ impl RunStatus {
         (self.state, self.failure) = (State::Finished(summary), None);
     }
 
-    /// Stores the reason of a failure, which the next start reports.
+    /// Marks a run as failed, and stores the reason, which the next start reports.
     pub(super) fn fail(&mut self, why: String) -> anyhow::Result<()> {
         let path = failure_path(&self.dir);
-        std::fs::write(&path, &why).with_context(|| format!("cannot write {}", path.display()))?;
+        let written = atomic_file::replace(&path, why.as_bytes());
         self.failure = Some(why);
-        Ok(())
+        written.with_context(|| format!("cannot write {}", path.display()))
     }
 }
 
@@ -94,7 +94,7 @@ fn failure_path(dir: &Path) -> PathBuf {
 const LENGTH: &str = "stop.max_env_steps";
 
 /// Returns the state of the run in `dir`, and the length to which it is extended.
-fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
+pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
     let run_toml = dir.join("run.toml");
     if !run_toml.exists() {
         return Ok((State::New, None));
@@ -178,7 +178,7 @@ fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
 
 fn has_learned(dir: &Path) -> bool {
     let n_metrics = std::fs::metadata(dir.join("metrics.jsonl")).map_or(0, |file| file.len());
-    n_metrics > 0 || !checkpoint::list(&dir.join("checkpoint")).is_empty()
+    n_metrics > 0 || !checkpoint::list(&run_directory::checkpoints(dir)).is_empty()
 }
 
 fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {

@@ -9,14 +9,14 @@ use tandem_worker::ServedTask;
 use toml::Value;
 
 use super::environment_file;
-use super::teacher_file::TeacherFile;
+use super::teacher_file::{TeacherFile, path_of_new_run};
 use crate::cli::{EnvironmentArgs, RecipeName, RecordingArgs, TrainArgs, chosen_task};
 use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
 use crate::service::worker_failed;
 use crate::shell::shell_word;
-use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
+use crate::{dashboard, output, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -97,7 +97,14 @@ impl Plan {
                 "{shown} holds a run already: resume it with `tandem train --resume --out {word}`, or choose another --out"
             ))),
             (false, true) => Err(run_directory::no_run(&format!("{shown} holds no run to resume"))),
-            _ => Ok(()),
+            (false, false) => match run_directory::runs_in(&self.out).first() {
+                Some(run) => Err(Failed::usage(format!(
+                    "{shown} holds other runs, such as {}: choose another --out",
+                    run.display()
+                ))),
+                None => Ok(()),
+            },
+            (true, true) => Ok(()),
         }
     }
 
@@ -191,7 +198,7 @@ impl Plan {
 
     /// Returns the directory of the checkpoints.
     pub(crate) fn checkpoints(&self) -> PathBuf {
-        self.out.join("checkpoint")
+        run_directory::checkpoints(&self.out)
     }
 
     /// Returns the directory of the logs of episodes.
@@ -201,7 +208,7 @@ impl Plan {
 
     /// Returns the path of the teacher's ledger.
     pub(crate) fn ledger(&self) -> PathBuf {
-        self.out.join("ledger.sqlite")
+        run_directory::ledger(&self.out)
     }
 }
 
@@ -345,25 +352,16 @@ fn check_advice_options(args: &TrainArgs, config: &RunConfig) -> Result<(), Fail
     })
 }
 
-/// Returns the name of the task that the run's teacher performs.
-fn task_of_teacher(config: &RunConfig) -> String {
-    let one_arm = config.layout().ok().and_then(|layout| layout.single_arm());
-    one_arm.map_or_else(|| config.task.clone(), |task| task.name().to_owned())
-}
-
 /// Loads the teacher, which must be a one-arm policy for the task.
 fn teacher_file(args: &TrainArgs, config: &RunConfig, out: &Path) -> Result<TeacherFile, Failed> {
     let own = || TeacherFile::copy_in(&out.join("policy"));
-    let teacher = match &args.teacher {
-        Some(path) => TeacherFile::load(path.clone(), args.teacher_critic.clone())?,
-        None => match args.resume.then(own).flatten() {
-            Some(own) => own?,
-            None => {
-                let path =
-                    policy_file::shipped_teacher_of(config.recipe, &task_of_teacher(config))?;
-                TeacherFile::load(path, None)?
-            }
-        },
+    let own = (args.resume && args.teacher.is_none()).then(own).flatten();
+    let teacher = match own {
+        Some(own) => own?,
+        None => {
+            let path = path_of_new_run(args.teacher.as_deref(), config)?;
+            TeacherFile::load(path, args.teacher_critic.clone())?
+        }
     };
     teacher.check(config)?;
     if let Some(remark) = teacher.other_recipe(config).filter(|_| !args.resume) {

@@ -58,6 +58,17 @@ impl From<anyhow::Error> for RunFailure {
     }
 }
 
+/// Whether a learner that was asked to exit has saved its state.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Saved {
+    /// It has.
+    Yes,
+    /// It could not, for this reason.
+    Failed(String),
+    /// It was killed at the deadline.
+    TooLate,
+}
+
 /// Events found by [`RunProcesses::check`].
 #[derive(Debug, Default)]
 pub(crate) struct ProcessEvents {
@@ -180,8 +191,8 @@ impl RunProcesses {
     }
 
     /// Asks all processes to exit and waits for them. The learner, which saves its state, has until `deadline`. The
-    /// teacher, which settles the learner's leases, ends after it. Returns whether the learner exited by itself.
-    pub(crate) async fn end(&mut self, deadline: Duration) -> bool {
+    /// teacher, which settles the learner's leases, ends after it. Returns whether the learner has saved its state.
+    pub(crate) async fn end(&mut self, deadline: Duration) -> Saved {
         let mut learner = None;
         let mut teacher = None;
         let mut workers = JoinSet::new();
@@ -193,15 +204,25 @@ impl RunProcesses {
                 Role::Worker => drop(workers.spawn(child.end(GRACE))),
             }
         }
-        let is_saved = match learner {
-            Some(learner) => learner.end(deadline).await,
-            None => true,
+        let saved = match learner {
+            Some(learner) => {
+                let offset = learner.log_offset();
+                match learner.end(deadline).await {
+                    Some(ProcessEnd::Code(0 | 130)) => Saved::Yes,
+                    Some(end) => {
+                        let reason = self.launcher.log().last_error_since(offset);
+                        Saved::Failed(format!("the learner {end}: {reason}"))
+                    }
+                    None => Saved::TooLate,
+                }
+            }
+            None => Saved::Yes,
         };
         if let Some(teacher) = teacher {
             teacher.end(GRACE).await;
         }
         workers.join_all().await;
-        is_saved
+        saved
     }
 
     /// Starts a service and returns its address. A service that a signal kills before it prints its address is

@@ -69,6 +69,34 @@ impl RunLock {
     }
 }
 
+/// The locks of a run directory that no process uses.
+#[derive(Debug)]
+pub(crate) struct UnusedRun {
+    _directory: DirectoryLock,
+    _checkpoints: Option<DirectoryLock>,
+    _ledger: Option<SqliteLedger>,
+}
+
+/// Locks a run directory; `None` while `tandem train`, a learner or a teacher uses it.
+pub(crate) fn unused(out: &Path) -> Result<Option<UnusedRun>, Failed> {
+    let Some(directory) = lock(out)? else { return Ok(None) };
+    let (checkpoints, ledger) = (run_directory::checkpoints(out), run_directory::ledger(out));
+    let checkpoints = match checkpoints.is_dir() {
+        true => match lock(&checkpoints)? {
+            Some(lock) => Some(lock),
+            None => return Ok(None),
+        },
+        false => None,
+    };
+    // The run reports a ledger that cannot be read.
+    let ledger = match ledger.exists().then(|| SqliteLedger::open(&ledger)) {
+        Some(Err(OpenError::InUse(_))) => return Ok(None),
+        Some(Ok(ledger)) => Some(ledger),
+        Some(Err(_)) | None => None,
+    };
+    Ok(Some(UnusedRun { _directory: directory, _checkpoints: checkpoints, _ledger: ledger }))
+}
+
 /// Opens the ledger, or returns `None` while another process has it open.
 fn open_ledger(path: &Path) -> Result<Option<SqliteLedger>, Failed> {
     match SqliteLedger::open(path) {

@@ -172,7 +172,9 @@ fn next_commands(plan: &Plan) -> Vec<String> {
     commands.push(format!("tandem policy export {policy} --onnx actor.onnx"));
     if plan.config.stop.max_env_steps > 0 {
         let longer = 2 * plan.config.stop.max_env_steps;
-        commands.push(format!("tandem train --resume --out {out} --max-env-steps {longer}"));
+        let minutes = if plan.config.stop.max_minutes > 0.0 { " --max-minutes 0" } else { "" };
+        commands
+            .push(format!("tandem train --resume --out {out} --max-env-steps {longer}{minutes}"));
     }
     commands
 }

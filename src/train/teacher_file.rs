@@ -38,6 +38,16 @@ enum Source {
     Server(PolicyServer),
 }
 
+/// Returns the teacher of a new run: the one that is `named`, or the shipped one for the task.
+pub(crate) fn path_of_new_run(named: Option<&Path>, config: &RunConfig) -> Result<PathBuf, Failed> {
+    if let Some(path) = named {
+        return Ok(path.to_owned());
+    }
+    let one_arm = config.layout().ok().and_then(|layout| layout.single_arm());
+    let task = one_arm.as_ref().map_or(config.task.as_str(), TaskSpec::name);
+    policy_file::shipped_teacher_of(config.recipe, task)
+}
+
 /// The copy of a teacher in a run directory.
 pub(super) struct StoredTeacher {
     pub(super) path: PathBuf,
@@ -47,7 +57,7 @@ pub(super) struct StoredTeacher {
 
 impl TeacherFile {
     /// Loads a policy file, or the ONNX model of an actor with its critic, or asks a server for its policy.
-    pub(super) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
+    pub(crate) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
         if is_onnx(&path) && policy_address(&path).is_none() {
             let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
             let (digest, layout) = (models.digest().to_owned(), models.layout());
@@ -114,7 +124,7 @@ impl TeacherFile {
     }
 
     /// Refuses a teacher that cannot advise the run of `config`.
-    pub(super) fn check(&self, config: &RunConfig) -> Result<(), Failed> {
+    pub(crate) fn check(&self, config: &RunConfig) -> Result<(), Failed> {
         let shown = self.path.display();
         if self.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use device::{ENOSPC, Fault, Mode};
-use run::{UNDISTURBED, check};
+use run::{UNDISTURBED, check, check_unsaved};
 
 /// Returns a fault for each pattern of `hits`, at the given percentage of the calls that match it.
 fn faults(mode: Mode, hits: &[(&str, usize)]) -> Vec<Fault> {
@@ -37,6 +37,12 @@ fn a_run_reports_a_dead_disk_and_resumes_on_another() {
     faults(Mode::Dead, &hits).iter().for_each(check);
     let full = faults(Mode::Dead, &[("write run/policy/last", 50)]).remove(0);
     check(&Fault { errno: ENOSPC, ..full });
+}
+
+#[test]
+fn an_interrupted_run_that_cannot_save_says_so() {
+    let hits = [("write run/checkpoint/#.safetensors.tmp", 50)];
+    faults(Mode::Dead, &hits).iter().for_each(check_unsaved);
 }
 
 #[test]

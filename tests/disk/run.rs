@@ -257,6 +257,15 @@ pub(crate) fn check(fault: &Fault) {
     assert_eq!(result, UNDISTURBED.0, "after {what}");
 }
 
+/// Checks that a run whose state cannot be saved says so when it is interrupted.
+pub(crate) fn check_unsaved(fault: &Fault) {
+    let device = Device::new();
+    let ended = Run::start(&device, Some(fault), false).end_or_interrupt();
+    let last = ended.stderr.lines().last().unwrap_or_default();
+    assert_eq!(ended.status.code(), Some(75), "{fault}: {}", ended.stderr);
+    assert!(last.contains("resume it with") && names_the_fault(last), "{fault}: {}", ended.stderr);
+}
+
 /// Checks that a run ended in a way that the fault allows, with one line that gives the reason.
 fn check_end(ended: &Ended, fault: &Fault, what: &str) {
     assert!(!ended.stderr.contains("panicked"), "{what}");
