@@ -30,6 +30,10 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let film = PlannedFilm::of(&args.film)?;
     args.live.live.map_or(Ok(()), live::check_address)?;
     args.record.as_deref().map_or(Ok(()), check_record)?;
+    if let Some(directory) = &args.record_dir {
+        std::fs::create_dir_all(directory)
+            .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
+    }
     let subject = subject(args)?;
     subject.warn_if_trained_on(args.seed);
     if args.robustness {
@@ -171,7 +175,7 @@ fn terms(subject: &EvaluatedPolicy) -> RunTerms {
 fn check_record(path: &Path) -> Result<(), Failed> {
     match std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
         true => Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file"))),
-        false => Ok(()),
+        false => output::check_directory_of(path),
     }
 }
 

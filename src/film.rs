@@ -10,6 +10,7 @@ use tandem_sim::{Env, SimError, WorldConfig};
 
 use crate::cli::FilmArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::output;
 
 /// Width and height of a picture in an animation, pixels.
 const ANIMATION_SIZE: (usize, usize) = (640, 400);
@@ -35,6 +36,7 @@ impl<'a> PlannedFilm<'a> {
     /// Checks the options of a film. Returns `None` if there is none.
     pub(crate) fn of(args: &'a FilmArgs) -> Result<Option<Self>, Failed> {
         let Some(path) = &args.film else { return Ok(None) };
+        output::check_directory_of(path)?;
         let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
         let (kind, default_size) = match ending.to_str() {
             Some("gif") => (Kind::Animation, ANIMATION_SIZE),

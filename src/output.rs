@@ -5,6 +5,7 @@
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, IsTerminal as _, Write as _};
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -59,6 +60,19 @@ pub(crate) fn report(failed: &Failed) -> ExitCode {
         message(format_args!("tandem: {}", failed.line()));
     }
     failed.exit().into()
+}
+
+/// Rejects a file that cannot be created because there is no directory for it. To be called before the work whose result
+/// it gets.
+pub(crate) fn check_directory_of(file: &Path) -> Result<(), Failed> {
+    match file.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        Some(parent) if !parent.is_dir() => Err(Failed::usage(format!(
+            "cannot write {}: there is no directory {}",
+            file.display(),
+            parent.display()
+        ))),
+        _ => Ok(()),
+    }
 }
 
 /// Waits until all messages are written, for at most 2 s.

@@ -23,6 +23,9 @@ use crate::{film, output, policy_file, run_file};
 const TEST_EPISODES: u64 = 240;
 
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
+    for file in [&args.csv, &args.markdown].into_iter().flatten() {
+        output::check_directory_of(file)?;
+    }
     let mut inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
     for run in &mut inputs.runs {
         // Runs of one configuration form a group, whichever version wrote their files.

@@ -118,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 99] = [
+const CASES: [(&str, i32, &str); 101] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -175,6 +175,8 @@ const CASES: [(&str, i32, &str); 99] = [
     ("bench scale --workers 0 --idle 0", 64, "nothing to measure"),
     ("eval --policy %teacher-push --robustness --baselines", 64, "--baselines"),
     ("eval --policy %teacher-push --robustness --film @empty/x.gif", 64, "--film"),
+    ("eval --policy %teacher-push --film @empty/x.gif", 64, "there is no directory"),
+    ("report @folder --csv @empty/x.csv", 64, "there is no directory"),
     ("eval --composed-teachers %student-push", 64, "a teacher drives one"),
     (
         "eval --composed-teachers %teacher-pick-and-place-classic --task carry-bar --arms 1",
