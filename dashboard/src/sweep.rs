@@ -129,7 +129,8 @@ struct State<'a> {
     end: &'a str,
     /// Environment steps of all runs.
     env_steps: u64,
-    /// Environment steps that end all runs; 0 if some run has no such limit.
+    /// Environment steps at the end of all runs: those that end a run or, once it is finished, those that it made; 0 if
+    /// some run has no such limit.
     max_env_steps: u64,
     env_steps_per_s: f64,
     live: Vec<Live<'a>>,
@@ -236,13 +237,21 @@ impl Feed {
             end: &view.end,
             env_steps: view.runs.iter().map(|run| run.env_steps).sum(),
             max_env_steps: match is_limited {
-                true => view.runs.iter().map(|run| run.max_env_steps).sum(),
+                true => view.runs.iter().map(env_steps_at_end).sum(),
                 false => 0,
             },
             env_steps_per_s: live.iter().map(|run| run.pace.env_steps_per_s).sum(),
             live,
             versions: self.versions,
         })
+    }
+}
+
+/// Returns the environment steps of a run at its end. A finished run may have ended before its limit.
+fn env_steps_at_end(run: &SweepRunView) -> u64 {
+    match run.state {
+        SweepRunState::Finished => run.env_steps,
+        _ => run.max_env_steps,
     }
 }
 
@@ -338,6 +347,28 @@ mod tests {
             (&1.into(), &400.into())
         );
         assert_eq!(json(&frame.documents["runs"])[0]["state"], "finished");
+    }
+
+    #[test]
+    fn a_finished_run_counts_the_steps_that_it_made() {
+        let early = SweepRunView { env_steps: 320, ..run("a", SweepRunState::Finished) };
+        let check = |other: SweepRunView, expected: (u64, u64)| {
+            let view = SweepView { runs: vec![early.clone(), other], ..SweepView::default() };
+            let state = json(&Feed::default().state(&view));
+            let (done, all) = (&state["env_steps"], &state["max_env_steps"]);
+            assert_eq!((done, all), (&expected.0.into(), &expected.1.into()));
+        };
+        check(early.clone(), (640, 640));
+        for state in [
+            SweepRunState::Waiting,
+            SweepRunState::Running,
+            SweepRunState::Failed,
+            SweepRunState::Saved,
+        ] {
+            check(SweepRunView { env_steps: 500, ..run("b", state) }, (820, 1320));
+        }
+        let unlimited = SweepRunView { max_env_steps: 0, ..run("b", SweepRunState::Running) };
+        check(unlimited, (320, 0));
     }
 
     #[test]

@@ -26,7 +26,7 @@ pub struct Comparison {
 pub struct FilmStrip {
     /// Describes the episode.
     pub title: String,
-    /// Name of the strip's own file, without a directory.
+    /// Name of the strip's own file, without a directory: `film-NUMBER-OUTCOME.png`.
     pub file_name: String,
     /// Content of the PNG file.
     pub png: Vec<u8>,

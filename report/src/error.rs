@@ -8,7 +8,7 @@ pub enum Error {
     /// A file operation failed.
     #[error("cannot {action} {path:?}")]
     Io {
-        /// The operation: `read` or `write`.
+        /// The operation: `read`, `write` or `remove`.
         action: &'static str,
         /// Path of the file.
         path: PathBuf,

@@ -28,7 +28,8 @@ pub struct ReportInputs {
 
 impl ReportInputs {
     /// Reads all runs and trials of `paths`: run directories, directories that contain runs or trials at any depth up
-    /// to six, and single metrics or trials files.
+    /// to six, and single metrics or trials files. Within a run directory, subdirectories that have a configuration are
+    /// further runs.
     ///
     /// Unusable runs and trials within a directory add to `warnings`.
     ///
@@ -109,7 +110,8 @@ struct FoundPaths {
     trials_files: Vec<PathBuf>,
 }
 
-/// The kind of directory that contains a searched one. Within a run directory, only trials count.
+/// The kind of directory that contains a searched one. Within a run directory, a metrics file alone does not make a
+/// run: the directory of another run has a configuration as well.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Parent {
     Directory,
@@ -119,7 +121,8 @@ enum Parent {
 impl FoundPaths {
     /// Adds `dir` itself and its subdirectories, in alphabetical order.
     fn search(&mut self, dir: &Path, depth: usize, parent: Parent) -> Result<(), Error> {
-        let is_run = parent == Parent::Directory && dir.join("metrics.jsonl").is_file();
+        let is_run = dir.join("metrics.jsonl").is_file()
+            && (parent == Parent::Directory || dir.join("run.toml").is_file());
         if is_run {
             self.run_dirs.push(dir.to_owned());
         }
@@ -196,6 +199,24 @@ mod tests {
             ReportInputs::load(&[dir.path().to_owned(), dir.path().join("lone.jsonl")]).unwrap();
         let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
         assert_eq!(names, ["b", "a", "lone"]);
+        assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn runs_within_the_directory_of_a_run_are_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = |name: &str| {
+            write(&dir.path().join(name).join("metrics.jsonl"), &line(1));
+            write(&dir.path().join(name).join("run.toml"), "task = \"push\"\n");
+        };
+        for name in ["runs", "runs/b", "runs/sweep/a", "runs/sweep/a/deeper"] {
+            run(name);
+        }
+        write(&dir.path().join("runs/checkpoint/metrics.jsonl"), &line(1));
+        write(&dir.path().join("runs/policy/run.toml"), "");
+        let inputs = ReportInputs::load(&[dir.path().join("runs")]).unwrap();
+        let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["runs", "b", "a", "deeper"]);
         assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
     }
 

@@ -1,6 +1,7 @@
 //! Reports as HTML pages that load nothing from elsewhere.
 
 mod comparison;
+mod figures;
 mod run;
 mod trials;
 
@@ -36,10 +37,10 @@ pub struct ReportFiles {
 }
 
 /// Writes a page with the tables, plots and film strips of `comparison` and `trials` to `path`, and each figure to a file
-/// in a directory beside it; see [`ReportFiles`].
+/// in a directory beside it; see [`ReportFiles`]. Figures of an earlier report in that directory are removed.
 ///
 /// # Errors
-/// If a curve cannot be drawn or a file cannot be written.
+/// If a curve cannot be drawn, or a file cannot be written or removed.
 pub fn report_html(
     comparison: &Comparison,
     trials: &Trials,
@@ -52,7 +53,7 @@ pub fn report_html(
     let svgs = curves.all().chain(&trial_plots);
     let svgs = svgs.map(|plot| (&plot.file_name, plot.svg.as_bytes()));
     let films = comparison.films.iter().map(|film| (&film.file_name, film.png.as_slice()));
-    let directory = figures_directory(path);
+    let directory = figures::directory(path);
     for (file_name, content) in svgs.chain(films) {
         if files.plots.is_empty() {
             create_directory(&directory)?;
@@ -75,11 +76,6 @@ pub fn report_html(
         (_, false) => "Comparison of runs",
     };
     write(path, page(title, &body).as_bytes())?;
+    figures::remove_former(&directory, &files.plots)?;
     Ok(files)
-}
-
-/// Returns the directory of the figures of the page at `path`.
-fn figures_directory(path: &Path) -> PathBuf {
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    path.with_file_name(format!("{stem}-figures"))
 }

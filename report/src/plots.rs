@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use tandem_core::Task;
-use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{Baseline, Comparison, Section};
 use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Series, curve_drawing};
@@ -52,6 +51,12 @@ const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 7] = [
     ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
     ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
 ];
+/// Slug and title of the panel that compares strategies.
+const STRATEGIES: &str = "strategies";
+/// Strategies with a threshold, and the letter of the panel that compares their thresholds.
+const FAMILIES: [(&str, char); 3] = [("mc-q", 'b'), ("mc-act", 'c'), ("mc-act-abs", 'd')];
+/// End of the slug of a plot of learning from scratch, after the task.
+const FROM_SCRATCH: &str = "-from-scratch";
 /// Number of [`VIEWS`] that a page shows first.
 const N_FIRST_VIEWS: usize = 5;
 
@@ -131,7 +136,7 @@ fn from_scratch(comparison: &Comparison) -> Result<Vec<Plot>, Error> {
         }
         let shown: Vec<&SeedGroup> = groups.iter().take(MAX_CURVES).collect();
         let title = format!("{task}: success from scratch (the paper's Figure 4{letter})");
-        let slug = format!("{task}-from-scratch");
+        let slug = format!("{task}{FROM_SCRATCH}");
         plots.push(draw((&shown, &[]), &title, &slug, Quantity::Success, Axis::PaperEpochs)?);
     }
     Ok(plots)
@@ -153,8 +158,28 @@ fn draw(
         series.extend(baselines.iter().filter_map(|baseline| level(baseline, quantity, x_max)));
     }
     let Drawing { wide, narrow } = curve_drawing(&series, CurveOptions::of(title, quantity, axis))?;
-    let file_name = format!("{}.svg", slug.to_lowercase().replace(' ', "-"));
+    let file_name = format!("{}.svg", file_stem(slug));
     Ok(Plot { file_name, title: title.to_owned(), svg: wide, narrow_svg: narrow })
+}
+
+fn file_stem(slug: &str) -> String {
+    slug.to_lowercase().replace(' ', "-")
+}
+
+/// Returns whether `stem` is the name of a plot's file without its extension, of this comparison or of another.
+pub(crate) fn is_file_stem(stem: &str) -> bool {
+    let is_panel = |slug: &str| {
+        let n_others = slug.strip_prefix("others-").map(str::parse::<usize>);
+        slug == STRATEGIES
+            || FAMILIES.iter().any(|one| one.0 == slug)
+            || matches!(n_others, Some(Ok(_)))
+    };
+    let is_view = |(name, _, axis, _): &(&str, Quantity, Axis, _)| {
+        let middle = file_stem(&format!("-{name}-{}-", axis.slug()));
+        stem.rsplit_once(&middle).is_some_and(|(_, panel)| is_panel(panel))
+    };
+    let is_from_scratch = |task: &Task| stem == format!("{task}{FROM_SCRATCH}");
+    VIEWS.iter().any(is_view) || Task::CLASSIC.iter().any(is_from_scratch)
 }
 
 /// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals, if `quantity`
@@ -175,32 +200,48 @@ fn level(Baseline { label, test }: &Baseline, quantity: Quantity, x_max: f64) ->
 ///
 /// The band of a single run is its 95 % interval. Several runs are drawn as their mean, with a band from the smallest
 /// to the largest value. Rows are matched by environment steps; a point covers the runs that have a row there.
+///
+/// Against wall time, whose mean depends on which runs it covers, a point covers all runs that have not ended before
+/// it. After the end of a run, the curve continues with those points of the others that are later than its last one.
 fn series(group: &SeedGroup, axis: Axis, quantity: Quantity) -> Series {
     if let [run] = group.runs.as_slice() {
         return Series::of(&group.label, &run.rows, axis, quantity);
     }
-    let mut rows_at: BTreeMap<u64, Vec<&MetricsRow>> = BTreeMap::new();
-    for row in group.runs.iter().flat_map(|run| &run.rows) {
-        rows_at.entry(row.env_steps).or_default().push(row);
+    let mut values_at: BTreeMap<u64, Vec<(f64, f64)>> = BTreeMap::new();
+    let mut ends = Vec::new();
+    for run in &group.runs {
+        let values = run.rows.iter().map(|row| (row.env_steps, axis.of(row), quantity.of(row)));
+        let values: Vec<_> = values.filter(|(_, x, y)| x.is_finite() && y.is_finite()).collect();
+        ends.extend(values.iter().map(|(env_steps, ..)| *env_steps).max());
+        for (env_steps, x, y) in values {
+            values_at.entry(env_steps).or_default().push((x, y));
+        }
     }
-    let point = |rows: Vec<&MetricsRow>| {
-        let points: Vec<(f64, f64)> = rows
-            .iter()
-            .map(|row| (axis.of(row), quantity.of(row)))
-            .filter(|(x, y)| x.is_finite() && y.is_finite())
-            .collect();
-        let n = points.len() as f64;
-        let ys = || points.iter().map(|(_, y)| *y);
-        (!points.is_empty()).then(|| CurvePoint {
-            x: points.iter().map(|(x, _)| x).sum::<f64>() / n,
-            y: ys().sum::<f64>() / n,
-            band: Some((
-                ys().fold(f64::INFINITY, f64::min),
-                ys().fold(f64::NEG_INFINITY, f64::max),
-            )),
-        })
-    };
-    Series { name: group.label.clone(), points: rows_at.into_values().filter_map(point).collect() }
+    if axis == Axis::Minutes {
+        let n_left = |env_steps: &u64| ends.iter().filter(|end| *end >= env_steps).count();
+        values_at.retain(|env_steps, values| values.len() >= n_left(env_steps));
+    }
+    let mut points: Vec<CurvePoint> = values_at.values().map(|values| mean(values)).collect();
+    if axis == Axis::Minutes {
+        let mut latest = f64::NEG_INFINITY;
+        points.retain(|point| {
+            let is_later = point.x > latest;
+            latest = latest.max(point.x);
+            is_later
+        });
+    }
+    Series { name: group.label.clone(), points }
+}
+
+/// Returns the mean of points (x, y), with a band from the smallest to the largest y.
+fn mean(values: &[(f64, f64)]) -> CurvePoint {
+    let n = values.len() as f64;
+    let ys = || values.iter().map(|(_, y)| *y);
+    CurvePoint {
+        x: values.iter().map(|(x, _)| x).sum::<f64>() / n,
+        y: ys().sum::<f64>() / n,
+        band: Some((ys().fold(f64::INFINITY, f64::min), ys().fold(f64::NEG_INFINITY, f64::max))),
+    }
 }
 
 /// Distributes all groups over panels: strategies, thresholds of each strategy, and other runs.
@@ -211,13 +252,13 @@ fn panels(groups: &[SeedGroup]) -> Vec<Panel<'_>> {
         plain.iter().filter(|group| represents_strategy(group, &plain)).copied().collect();
     if !strategies.is_empty() {
         panels.push(Panel {
-            slug: "strategies".to_owned(),
-            title: "strategies".to_owned(),
+            slug: STRATEGIES.to_owned(),
+            title: STRATEGIES.to_owned(),
             letter: Some('a'),
             groups: strategies,
         });
     }
-    for (family, letter) in [("mc-q", 'b'), ("mc-act", 'c'), ("mc-act-abs", 'd')] {
+    for (family, letter) in FAMILIES {
         let members: Vec<&SeedGroup> =
             plain.iter().filter(|group| strategy_name(group) == family).copied().collect();
         if members.len() > 1 {
@@ -285,7 +326,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use tandem_telemetry::ContactMetrics;
+    use tandem_telemetry::{ContactMetrics, MetricsRow};
 
     use crate::group::group_by_settings;
     use crate::run::Run;
@@ -325,6 +366,25 @@ mod tests {
         assert_eq!(second.band, Some((0.6, 0.8)));
         assert_eq!((third.x, third.y, third.band), (6.0, 0.9, Some((0.9, 0.9))));
         assert!(series(&groups[0], Axis::EnvSteps, Quantity::MeanQ).points.is_empty());
+    }
+
+    #[test]
+    fn a_curve_against_wall_time_never_runs_backwards() {
+        let xs = |runs: &[&[(u64, f64, f64)]]| -> Vec<f64> {
+            let runs = runs.iter().zip(1..).map(|(rows, seed)| run("ea", seed, "ea", rows));
+            let groups = group_by_settings(runs.collect());
+            let drawn = series(&groups[0], Axis::Minutes, Quantity::Success);
+            let xs: Vec<f64> = drawn.points.iter().map(|point| point.x).collect();
+            assert!(xs.is_sorted_by(|a, b| a < b), "{xs:?}");
+            xs
+        };
+        let fast = [1, 2, 3, 4, 5].map(|n: u32| (u64::from(n) * 1000, 60.0 * f64::from(n), 0.5));
+        let slow = [(1000, 180.0, 0.2), (2000, 360.0, 0.3)];
+        assert_eq!(xs(&[&fast, &slow]), [2.0, 4.0, 5.0]);
+        // The last row of a run that a time limit ended is at a step of its own.
+        let limited = [slow[0], slow[1], (2400, 420.0, 0.4)];
+        assert_eq!(xs(&[&limited, &fast]), [2.0, 4.0, 5.0]);
+        assert_eq!(xs(&[&[], &fast, &slow[..1]]), [2.0, 3.0, 4.0, 5.0]);
     }
 
     #[test]
@@ -379,6 +439,8 @@ mod tests {
             let unique: BTreeSet<String> = plots.iter().map(|plot| text(plot)).collect();
             assert_eq!(unique.len(), 12, "{unique:?}");
         }
+        let stem = |plot: &&Plot| plot.file_name.trim_end_matches(".svg").to_owned();
+        assert!(plots.iter().map(stem).all(|stem| is_file_stem(&stem)));
     }
 
     #[test]

@@ -200,6 +200,23 @@ fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
     Plot { file_name, title, svg: wide, narrow_svg: narrow }
 }
 
+/// Returns whether `stem` is the name of a plot's file without its extension, of these trials or of others.
+pub(crate) fn is_file_stem(stem: &str) -> bool {
+    let numbers = stem.strip_prefix("trial-").and_then(|rest| rest.rsplit_once("-seed"));
+    let Some((_, numbers)) = numbers else { return false };
+    let parts: Vec<&str> = numbers.split('-').collect();
+    let is_number = |text: &str| text.parse::<u64>().is_ok();
+    match parts.as_slice() {
+        [seed, trial] => is_number(seed) && is_number(trial),
+        [seed, trial, again] => {
+            is_number(seed)
+                && is_number(trial)
+                && again.strip_prefix("again").is_some_and(is_number)
+        }
+        _ => false,
+    }
+}
+
 /// Largest number of characters of a policy's name in the name of a file.
 const MAX_NAME_PART: usize = 100;
 

@@ -1,6 +1,7 @@
 //! Plots and pages are well-formed and complete for any names and numbers.
 
-use std::path::Path;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
 
 use tandem_report::{
     Axis, Baseline, Comparison, CurveOptions, CurvePoint, FilmStrip, PlottedTrials, Quantity,
@@ -179,6 +180,33 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     for reference in ["<script", "<link", "src=\"http", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");
     }
+}
+
+#[test]
+fn a_report_removes_the_figures_of_an_earlier_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let (runs, page) = (dir.path().join("runs"), dir.path().join("report.html"));
+    std::fs::create_dir(&runs).unwrap();
+    let report = || {
+        let inputs = ReportInputs::load(std::slice::from_ref(&runs)).unwrap();
+        let comparison = Comparison::of(inputs.runs, Vec::new());
+        report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap()
+    };
+    let figures = || -> BTreeSet<PathBuf> {
+        let entries = std::fs::read_dir(dir.path().join("report-figures")).unwrap();
+        entries.map(|entry| entry.unwrap().path()).collect()
+    };
+    seed_of(&runs, "mc-q:0.1", 1, &[row(0, 0), row(5, 120)]);
+    seed_of(&runs, "mc-q:0.05", 1, &[row(0, 0), row(5, 120)]);
+    seed_of(&runs, "none", 1, &[row(0, 0), row(5, 60)]);
+    let first = report();
+    assert_eq!(figures(), BTreeSet::from_iter(first.plots.clone()));
+    let own = dir.path().join("report-figures/own.svg");
+    std::fs::write(&own, "").unwrap();
+    std::fs::remove_dir_all(runs.join("push-mc-q-0.05-seed1")).unwrap();
+    let second = report();
+    assert!(second.plots.len() < first.plots.len(), "{:?}", second.plots);
+    assert_eq!(figures(), second.plots.into_iter().chain([own]).collect());
 }
 
 /// The settings of a run of a task that is not built-in, with one point per arm and episodes of 100 steps.

@@ -46,6 +46,12 @@ pub enum Error {
         /// Path of the file.
         path: PathBuf,
     },
+    /// An MCAP file has no message before its end or its first damage.
+    #[error("{path:?} has no message to recover")]
+    NothingToRecover {
+        /// Path of the file.
+        path: PathBuf,
+    },
     /// The file is an MCAP file, but not the log of an episode.
     #[error("{path:?} is not the log of an episode: {problem}")]
     NotAnEpisode {

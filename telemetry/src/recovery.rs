@@ -29,17 +29,40 @@ pub struct RecoveredCounts {
 /// error leaves no incomplete file.
 ///
 /// # Errors
-/// If `source` cannot be read or does not start like an MCAP file, or if `destination` cannot be written.
+/// If `source` cannot be read, does not start like an MCAP file or is damaged before its first message, or if `destination`
+/// cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
     let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {
         return Err(Error::NotMcap { path: source.to_owned() });
     }
-    atomic_file::replace_with(destination, |file| copy_readable(&bytes, file))
-        .map_err(Error::write_log(destination))
+    atomic_file::replace_with(destination, |file| copy_readable(&bytes, file)).map_err(|error| {
+        match error {
+            CopyError::NoMessage => Error::NothingToRecover { path: source.to_owned() },
+            CopyError::Write(error) => Error::write_log(destination)(error),
+        }
+    })
 }
 
-fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts> {
+/// The reason why a file is not copied.
+enum CopyError {
+    NoMessage,
+    Write(McapError),
+}
+
+impl From<McapError> for CopyError {
+    fn from(error: McapError) -> Self {
+        Self::Write(error)
+    }
+}
+
+impl From<std::io::Error> for CopyError {
+    fn from(error: std::io::Error) -> Self {
+        Self::Write(error.into())
+    }
+}
+
+fn copy_readable(bytes: &[u8], file: &File) -> Result<RecoveredCounts, CopyError> {
     let mut copy = Copy {
         writer: write_options().create(BufWriter::new(file))?,
         counts: RecoveredCounts::default(),
@@ -58,6 +81,9 @@ fn copy_readable(bytes: &[u8], file: &File) -> mcap::McapResult<RecoveredCounts>
             copy.counts.ended_by = Some(damage.to_string());
             break;
         }
+    }
+    if copy.counts.messages == 0 && copy.counts.ended_by.is_some() {
+        return Err(CopyError::NoMessage);
     }
     copy.writer.finish()?;
     Ok(copy.counts)
@@ -105,5 +131,31 @@ impl Copy<'_> {
             _ => {}
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::log_file::LogFile;
+
+    #[test]
+    fn a_log_of_metadata_alone_is_refused_and_nothing_is_written() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let source = directory.path().join("torn.mcap.part");
+        let mut log = LogFile::create(&directory.path().join("torn.mcap")).expect("creates");
+        log.write_metadata("kind", [("a".to_owned(), "b".to_owned())].into()).expect("writes");
+        log.flush().expect("writes");
+        let destination = directory.path().join("recovered.mcap");
+        for _ in 0..2 {
+            let refusal = recover(&source, &destination).expect_err("no message");
+            assert_eq!(refusal.to_string(), format!("{source:?} has no message to recover"));
+            let left = std::fs::read_dir(directory.path()).expect("readable").flatten();
+            let left: Vec<PathBuf> = left.map(|entry| entry.path()).collect();
+            assert_eq!(left, std::slice::from_ref(&source));
+            std::fs::write(&source, mcap::MAGIC).expect("writes");
+        }
     }
 }

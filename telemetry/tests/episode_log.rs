@@ -192,22 +192,19 @@ fn a_file_cut_anywhere_is_recovered_and_more_bytes_give_no_fewer_messages() {
     let (dir, bytes) = complete_log();
     let mut best = 0;
     for n_bytes in (MAGIC_BYTES..bytes.len()).step_by(307).chain([bytes.len() - 1, bytes.len()]) {
-        let (n_messages, log) = recovered(dir.path(), &bytes[..n_bytes]).unwrap();
+        let (n_messages, log) = match recovered(dir.path(), &bytes[..n_bytes]) {
+            Ok((n_messages, log)) => (n_messages, Some(log.unwrap())),
+            Err(Error::NothingToRecover { .. }) => (0, None),
+            Err(error) => panic!("{n_bytes} bytes: {error:?}"),
+        };
         assert!(
             n_messages >= best,
             "{n_bytes} bytes gave {n_messages} messages, fewer gave {best}"
         );
         best = n_messages;
-        match log {
-            Ok(log) => {
-                assert!(log.transitions == synthetic::transitions()[..log.transitions.len()]);
-            }
-            Err(error) => {
-                assert!(
-                    matches!(error, Error::NotAnEpisode { .. }) && n_messages == 0,
-                    "{error:?}"
-                );
-            }
+        assert_eq!(log.is_some(), n_messages > 0, "{n_bytes} bytes");
+        if let Some(log) = log {
+            assert!(log.transitions == synthetic::transitions()[..log.transitions.len()]);
         }
     }
     assert_eq!(best, 51 * 3 + 50 * 2 + 2);
@@ -223,12 +220,16 @@ fn a_damaged_file_is_refused_and_its_recovery_never_panics() {
         std::fs::write(&path, &damaged).unwrap();
         assert!(read_episode(&path).is_err(), "byte {offset}");
         let recovered = recovered(dir.path(), &damaged);
-        assert_eq!(recovered.is_ok(), offset >= MAGIC_BYTES, "byte {offset}");
-        if let Ok((_, Ok(log))) = recovered {
-            assert!(
-                log.transitions == synthetic::transitions()[..log.transitions.len()],
-                "byte {offset}"
-            );
+        let is_mcap = !matches!(recovered, Err(Error::NotMcap { .. }));
+        assert_eq!(is_mcap, offset >= MAGIC_BYTES, "byte {offset}");
+        match recovered {
+            Ok((n_messages, log)) => {
+                assert!(n_messages > 0, "byte {offset}");
+                let log = log.map_or_else(|_| Vec::new(), |log| log.transitions);
+                assert!(log == synthetic::transitions()[..log.len()], "byte {offset}");
+            }
+            Err(Error::NotMcap { .. } | Error::NothingToRecover { .. }) => {}
+            Err(error) => panic!("byte {offset}: {error:?}"),
         }
     }
 }
@@ -280,6 +281,19 @@ fn garbage_is_not_recovered_as_an_empty_file() {
         Err(Error::NotMcap { .. })
     ));
     assert!(!destination.exists());
+}
+
+#[test]
+fn a_file_without_messages_is_not_recovered_as_an_empty_file() {
+    let (dir, bytes) = complete_log();
+    let names = || std::fs::read_dir(dir.path()).unwrap().count();
+    let n_before = names() + 1;
+    for n_bytes in [MAGIC_BYTES, MAGIC_BYTES + 1, 100] {
+        let refusal = recovered(dir.path(), &bytes[..n_bytes]).unwrap_err();
+        assert!(matches!(refusal, Error::NothingToRecover { .. }), "{refusal:?}");
+        assert!(refusal.to_string().ends_with("cut.mcap.part\" has no message to recover"));
+        assert_eq!(names(), n_before, "only the log itself is there");
+    }
 }
 
 #[test]

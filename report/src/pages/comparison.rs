@@ -9,8 +9,9 @@ use crate::plots::{ComparisonPlots, Plot, n_first_plots};
 const NOTES: &str = "Values over several runs are the mean, with the smallest and the largest below it where a table has room, \
      and the number of runs that have the value if some do not. Intervals are Wilson's 95 % intervals over the episodes of \
      all runs; they do not include the variation between seeds. Bands of curves are from the smallest to the largest value \
-     over seeds, or the 95 % interval of a single run. The best of many evaluations is biased upwards; the evaluation on \
-     test goals is not. Success without contact is that without contact between the arms.";
+     over seeds, or the 95 % interval of a single run. Against wall time, a curve continues after the end of a run \
+     with the later points of the others. The best of many evaluations is biased upwards; the evaluation on test goals \
+     is not. Success without contact is that without contact between the arms.";
 
 /// Explains why the paper's values are apart.
 const PAPER_NOTES: &str = "The paper's values are from another simulator, recipe, start distribution and count of epochs: they \
