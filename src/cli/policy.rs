@@ -70,7 +70,7 @@ pub(crate) struct ExportArgs {
 Examples:
   tandem policy import actor.onnx --critic critic.onnx --out FILE.safetensors
   tandem policy import actor.onnx --task push --arms 1 --out FILE.safetensors
-  tandem policy import actor.onnx --env-command 'python3 server.py' \
+  tandem policy import actor.onnx --env-command 'python3 server.py' \\
       --out FILE.safetensors
   tandem eval --composed-teachers FILE.safetensors
 
