@@ -87,7 +87,9 @@ impl MotionJournal {
         self.now_s = view.time_s;
         let is_fault = self.is_new_fault(view);
         self.stop.clone_from(&view.stop);
-        if self.open.as_ref().is_some_and(|log| log.is_over(view)) {
+        // A fault after the end of a motion, or after another stop, is not its outcome.
+        let is_over = |log: &OpenLog| (is_fault && log.outcome.is_some()) || log.is_over(view);
+        if self.open.as_ref().is_some_and(is_over) {
             self.close();
         }
         if self.open.is_none() && (view.motion.is_some() || is_fault) {

@@ -23,10 +23,13 @@ pub struct RecoveredCounts {
     pub ended_by: Option<String>,
 }
 
-/// Copies all readable records of `source`, up to the first damage, to the complete file `destination`.
+/// Copies schemas, channels, messages and metadata of `source`, up to the first damage, to the complete file
+/// `destination`.
 ///
-/// This works for any MCAP file. `source` is not modified. `destination` is created only when it is complete, so an
-/// error leaves no incomplete file.
+/// Files of other programs can be recovered too. Their attachments and the profile in their header are not copied, and
+/// a record or chunk of more than 16 MiB counts as damage.
+///
+/// `source` is not modified. `destination` is created only when it is complete, so an error leaves no incomplete file.
 ///
 /// # Errors
 /// If `source` cannot be read, does not start like an MCAP file or is damaged before its first message, or if `destination`

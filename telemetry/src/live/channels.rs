@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use foxglove::{Context, FoxgloveError, PartialMetadata, RawChannel, Schema};
 
-use super::episode::{ChannelDescription, Episode};
+use super::episode::{ChannelDescription, Episode, TimedMessage};
 use crate::error::Error;
 
 /// Channels by topic.
@@ -58,13 +58,16 @@ impl Channels {
         }
     }
 
-    /// Publishes the latest message of each channel among the first `end` ones, with the time `now_ns`.
+    /// Publishes the latest message of each channel among the first `end` ones, with the time `now_ns`. The scene is
+    /// then the only one that viewers show.
     pub(super) fn publish_latest(&self, episode: &Episode, end: usize, now_ns: u64) {
-        let mut latest: BTreeMap<usize, &[u8]> = BTreeMap::new();
+        let mut latest: BTreeMap<usize, &TimedMessage> = BTreeMap::new();
         for message in &episode.messages[..end] {
-            latest.insert(message.channel, &message.data);
+            latest.insert(message.channel, message);
         }
-        for (channel, data) in latest {
+        for (channel, message) in latest {
+            let alone = episode.alone(message);
+            let data = alone.as_deref().unwrap_or(&message.data);
             self.publish_at(episode, channel, data, now_ns);
         }
     }

@@ -3,14 +3,20 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use foxglove::messages::{FrameTransforms, JointStates, Log, SceneUpdate, Timestamp};
+use foxglove::messages::scene_entity_deletion::Type;
+use foxglove::messages::{
+    FrameTransforms, JointStates, Log, SceneEntityDeletion, SceneUpdate, Timestamp,
+};
 use foxglove::{Decode, Encode};
 use mcap::McapError;
 use mcap::records::Record;
 
+use crate::arms_messages::SCENE;
 use crate::error::Error;
 use crate::log_file::timestamp;
 use crate::records::{Records, read_mcap};
+
+const SCENE_SCHEMA: &str = "foxglove.SceneUpdate";
 
 /// A channel of a log.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,16 +95,64 @@ impl Episode {
         self.messages.partition_point(|message| message.time_ns <= time_ns)
     }
 
-    /// Moves the episode to a later time, with the stamps within its messages.
+    /// Moves the episode to a later time, with the stamps within its messages. Its first scene then deletes those of
+    /// the episodes before it.
     pub(super) fn shift(&mut self, offset_ns: u64) {
+        self.ensure_scene();
         for message in &mut self.messages {
             message.time_ns = message.time_ns.saturating_add(offset_ns);
-            let schema = self.channels[message.channel].schema.as_ref();
-            let name = schema.map_or("", |(name, _, _)| name.as_str());
-            if let Some(shifted) = with_shifted_stamps(name, &message.data, offset_ns) {
+            let schema = self.channels[message.channel].schema_name();
+            if let Some(shifted) = with_shifted_stamps(schema, &message.data, offset_ns) {
                 message.data = shifted;
             }
         }
+        let alone =
+            self.messages.iter().enumerate().find_map(|(idx, it)| Some((idx, self.alone(it)?)));
+        if let Some((first_idx, alone)) = alone {
+            self.messages[first_idx].data = alone;
+        }
+    }
+
+    /// Adds an empty scene at the start, unless the episode has a scene.
+    fn ensure_scene(&mut self) {
+        let is_scene = |it: &TimedMessage| self.channels[it.channel].schema_name() == SCENE_SCHEMA;
+        if self.messages.iter().any(is_scene) {
+            return;
+        }
+        let schema = SceneUpdate::get_schema();
+        let schema = schema.map(|it| (it.name, it.encoding, it.data.into_owned()));
+        let (time_ns, channel, data) = (0, self.channels.len(), Vec::new());
+        self.messages.insert(0, TimedMessage { time_ns, channel, data });
+        self.channels.push(ChannelDescription {
+            topic: SCENE.to_owned(),
+            message_encoding: SceneUpdate::get_message_encoding(),
+            schema,
+        });
+    }
+
+    /// Returns a message with a scene that also deletes everything shown before. Viewers keep an entity until another
+    /// one replaces or a message deletes it. Returns `None` for other messages.
+    pub(super) fn alone(&self, message: &TimedMessage) -> Option<Vec<u8>> {
+        if self.channels[message.channel].schema_name() != SCENE_SCHEMA {
+            return None;
+        }
+        changed::<SceneUpdate>(&message.data, |update| {
+            // Entities of this stamp or a later one are kept.
+            let stamp = update.entities.first().and_then(|entity| entity.timestamp);
+            let stamp = stamp.unwrap_or_else(|| timestamp(message.time_ns));
+            let everything = SceneEntityDeletion {
+                timestamp: Some(stamp),
+                r#type: Type::All.into(),
+                id: String::new(),
+            };
+            update.deletions = vec![everything];
+        })
+    }
+}
+
+impl ChannelDescription {
+    fn schema_name(&self) -> &str {
+        self.schema.as_ref().map_or("", |(name, _, _)| name.as_str())
     }
 }
 
@@ -110,7 +164,7 @@ fn with_shifted_stamps(schema: &str, data: &[u8], offset_ns: u64) -> Option<Vec<
         }
     };
     match schema {
-        "foxglove.SceneUpdate" => changed::<SceneUpdate>(data, |update| {
+        SCENE_SCHEMA => changed::<SceneUpdate>(data, |update| {
             update.entities.iter_mut().for_each(|entity| shift(&mut entity.timestamp));
         }),
         "foxglove.FrameTransforms" => changed::<FrameTransforms>(data, |frames| {
@@ -130,4 +184,57 @@ fn changed<M: Decode + Encode>(data: &[u8], change: impl FnOnce(&mut M)) -> Opti
     let mut encoded = Vec::with_capacity(data.len());
     message.encode(&mut encoded).ok()?;
     Some(encoded)
+}
+
+#[cfg(test)]
+mod tests {
+    use foxglove::messages::SceneEntity;
+
+    use super::*;
+
+    /// Returns an episode with a scene of one entity at each of `times_ns`.
+    fn episode(times_ns: &[u64]) -> Episode {
+        let mut episode = Episode { channels: Vec::new(), messages: Vec::new() };
+        episode.ensure_scene();
+        episode.messages.clear();
+        for time_ns in times_ns {
+            let stamp = Some(timestamp(*time_ns));
+            let entity =
+                SceneEntity { timestamp: stamp, id: "arm0".to_owned(), ..SceneEntity::default() };
+            let update = SceneUpdate { deletions: Vec::new(), entities: vec![entity] };
+            let mut data = Vec::new();
+            update.encode(&mut data).expect("encodes");
+            episode.messages.push(TimedMessage { time_ns: *time_ns, channel: 0, data });
+        }
+        episode
+    }
+
+    #[test]
+    fn only_the_first_scene_deletes_those_of_earlier_episodes() {
+        let check = |times_ns: &[u64], expected: &[(u64, usize, usize)]| {
+            let mut episode = episode(times_ns);
+            episode.shift(3_000_000_000);
+            let shifted = episode.messages.iter().map(|message| {
+                let update = SceneUpdate::decode(message.data.as_slice()).expect("a scene");
+                let stamp = Some(timestamp(message.time_ns));
+                for deletion in &update.deletions {
+                    assert_eq!((deletion.r#type(), deletion.timestamp), (Type::All, stamp));
+                }
+                assert!(update.entities.iter().all(|entity| entity.timestamp == stamp));
+                (message.time_ns, update.deletions.len(), update.entities.len())
+            });
+            assert_eq!(shifted.collect::<Vec<_>>(), expected);
+        };
+        check(&[0, 500_000_000], &[(3_000_000_000, 1, 1), (3_500_000_000, 0, 1)]);
+        check(&[250_000_000], &[(3_250_000_000, 1, 1)]);
+        check(&[], &[(3_000_000_000, 1, 0)]);
+    }
+
+    #[test]
+    fn a_scene_deletes_what_is_older_than_it_at_most_once() {
+        let mut episode = episode(&[0]);
+        episode.shift(1_000_000_000);
+        let first = &episode.messages[0];
+        assert_eq!(episode.alone(first).as_ref(), Some(&first.data));
+    }
 }

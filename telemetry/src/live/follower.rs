@@ -107,10 +107,10 @@ impl Follower {
         let left_out = new.iter().filter(is_left_out);
         self.seen.extend(left_out.filter_map(|log| Some((log.clone(), *logs.get(log)?))));
         let mut episode = Episode::read(&path).ok()?;
+        self.server.channels.open(&episode.channels).ok()?;
         let start_ns = if self.end_ns == 0 { 0 } else { self.end_ns.saturating_add(PAUSE_NS) };
         episode.shift(start_ns);
         self.end_ns = start_ns.max(episode.end_ns());
-        self.server.channels.open(&episode.channels).ok()?;
         tracing::debug!(?path, "episode played to viewers");
         Some(episode)
     }

@@ -1,16 +1,18 @@
 //! Logs played to a client of the websocket protocol.
 
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use foxglove::Decode as _;
 use foxglove::messages::SceneUpdate;
+use foxglove::messages::scene_entity_deletion::Type;
 use serde_json::{Value, json};
-use tandem_telemetry::Error;
+use tandem_core::{Layout, Task, TaskSpec};
 use tandem_telemetry::live::{Clock, Follower, LiveArms, Replay};
+use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, Error};
 use tungstenite::{ClientRequestBuilder, Message, WebSocket};
 
 use crate::episode_log_tests::{motion, synthetic};
@@ -145,9 +147,27 @@ impl Viewer {
 }
 
 /// Writes two logs of 2 s.
-fn logs(directory: &std::path::Path) -> Vec<PathBuf> {
+fn logs(directory: &Path) -> Vec<PathBuf> {
     let names = ["eval-000001-000.mcap", "eval-000001-001.mcap"];
     names.map(|name| synthetic::write_log(&directory.join(name)).unwrap()).to_vec()
+}
+
+/// Writes a log of 2 s with one arm.
+fn write_one_arm_log(path: &Path) -> PathBuf {
+    let layout = TaskSpec::from(Layout::new(Task::Push, 1));
+    let mut scene = synthetic::scene(0.0);
+    scene.arms.truncate(1);
+    scene.objects.truncate(1);
+    scene.goals.truncate(1);
+    let mut step = synthetic::transitions_of(&layout).remove(0);
+    (step.rewards_per_arm, step.advice, step.advised_arms) = (vec![-1.0], Vec::new(), 0);
+    step.budget_left = None;
+    let metadata = EpisodeMetadata { layout: layout.clone(), ..synthetic::metadata() };
+    let mut recorder = EpisodeRecorder::create(path, &metadata).unwrap();
+    recorder.record_step(&scene, &synthetic::record(0, &step)).unwrap();
+    scene.time_s = 2.0;
+    recorder.record_outcome(&scene, &vec![0.25; layout.n_observation()]).unwrap();
+    recorder.finish().unwrap()
 }
 
 fn any_port() -> SocketAddr {
@@ -231,6 +251,49 @@ fn a_viewer_seeks_a_replay_and_gets_the_messages_of_that_time() {
             viewer.wait_for(|message| {
                 matches!(message, Received::State(3, 4_500_000_000, _)).then_some(())
             });
+        },
+    );
+}
+
+#[test]
+fn the_first_scene_of_a_log_and_of_a_sought_time_deletes_all_others() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    let two_arms = synthetic::write_log(&path("eval-000001-000.mcap")).unwrap();
+    let paths = [two_arms, write_one_arm_log(&path("eval-000001-001.mcap"))];
+    let clock = ManualClock::default();
+    let replay = Replay::start(any_port(), &paths, clock.clock()).unwrap();
+    let address = replay.address();
+    while_playing(
+        |stop| replay.run(stop).unwrap(),
+        || {
+            let mut viewer = Viewer::connect(address);
+            let (_, [scene]) = viewer.channels(["/scene"]);
+            viewer.subscribe(1, scene);
+            // The number of arms that a scene shows, and the number of times that it deletes all others.
+            let next = |viewer: &mut Viewer| {
+                viewer.wait_for(|message| {
+                    let Received::Data(1, time_ns, data) = message else { return None };
+                    let update = SceneUpdate::decode(data.as_slice()).unwrap();
+                    assert!(update.deletions.iter().all(|it| it.r#type() == Type::All));
+                    let is_arm = |id: &str| id.starts_with("arm");
+                    let n_arms = update.entities.iter().filter(|it| is_arm(&it.id)).count();
+                    Some((time_ns, n_arms, update.deletions.len()))
+                })
+            };
+            assert_eq!(next(&mut viewer), (0, 2, 1), "the present state");
+            clock.set(2_600);
+            let mut shown = next(&mut viewer);
+            while shown.0 < 2_500_000_000 {
+                assert_eq!(shown.1, 2, "at {} ns", shown.0);
+                shown = next(&mut viewer);
+            }
+            assert_eq!((shown.1, shown.2), (1, 1), "the first scene of the second log");
+            viewer.control(false, 1.0, Some(1_000_000_000));
+            while shown.0 != 1_000_000_000 {
+                shown = next(&mut viewer);
+            }
+            assert_eq!((shown.1, shown.2), (2, 1), "the scene of the sought time");
         },
     );
 }

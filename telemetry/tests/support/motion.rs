@@ -128,6 +128,42 @@ fn a_fault_without_a_motion_leaves_a_log_and_an_expected_stop_does_not() {
 }
 
 #[test]
+fn a_fault_just_after_a_motion_leaves_a_log_of_its_own() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut journal = journal(directory.path());
+    record(&mut journal, (0..100).map(moving));
+    let after = |view| ArmsView { n_motions: 1, ..view };
+    record(&mut journal, (100..110).map(idle).map(after));
+    record(&mut journal, (110..200).map(|step| stopped(step, "emergency-stop")));
+    journal.finish();
+    let expected = ["motion-20261123160000-000001.mcap", "stop-20261123160000-000002.mcap"];
+    assert_eq!(names(directory.path()), expected);
+    let outcomes = logs(directory.path());
+    let outcomes = [0, 1].map(|log| metadata(&outcomes[log], "tandem.motion.outcome"));
+    assert_eq!(outcomes[0]["outcome"], "done");
+    assert_eq!(outcomes[1]["outcome"], "stopped");
+    assert_eq!(outcomes[1]["cause"], "emergency-stop");
+    let messages = layout::messages(&logs(directory.path())[1]);
+    // The last second before the stop and half a second after it.
+    let n_measured = messages["/joint_states"].len();
+    assert!((145..=155).contains(&n_measured), "{n_measured}");
+}
+
+#[test]
+fn a_fault_while_a_motion_settles_is_its_outcome() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut journal = journal(directory.path());
+    record(&mut journal, (0..100).map(moving));
+    let settling = |view| ArmsView { phase: ArmsPhase::Settling, ..view };
+    record(&mut journal, (100..110).map(moving).map(settling));
+    record(&mut journal, (110..200).map(|step| stopped(step, "emergency-stop")));
+    journal.finish();
+    assert_eq!(names(directory.path()), ["motion-20261123160000-000001.mcap"]);
+    let outcome = metadata(&logs(directory.path())[0], "tandem.motion.outcome");
+    assert_eq!(outcome["cause"], "emergency-stop");
+}
+
+#[test]
 fn the_log_of_a_killed_bridge_can_be_recovered() {
     let directory = tempfile::tempdir().unwrap();
     let mut journal = journal(directory.path());
