@@ -4,9 +4,11 @@ use std::io::{self, ErrorKind};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::Path;
 
-use tandem_dashboard::Access;
-use tandem_net::is_exposed;
+use tandem_dashboard::{Access, Site};
+use tandem_net::{Capacity, is_exposed};
+use tandem_system::fd_limit;
 use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
 
 use crate::access;
 use crate::cli::DashboardArgs;
@@ -70,6 +72,17 @@ pub(crate) async fn bind_free(address: SocketAddr) -> io::Result<TcpListener> {
         }
     }
     bound
+}
+
+/// Serves `site` until `shutdown` is cancelled, with as many connections as the limit of open files allows.
+pub(crate) async fn serve(
+    site: Site,
+    access: Access,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+) {
+    let capacity = Capacity::of_dashboard(fd_limit::raise());
+    tandem_dashboard::serve(site, access, listener, capacity, shutdown).await;
 }
 
 /// Returns the address to enter in a browser on this machine.

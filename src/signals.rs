@@ -56,8 +56,8 @@ pub(crate) fn ignore_file_size_signal() {
     }
 }
 
-/// Waits until standard input closes. A separate thread reads it, because a runtime does not shut down before its own
-/// blocking reads return.
+/// Waits until standard input closes. A separate thread reads it, because the bridge's runtime does not shut down
+/// before its own blocking reads return.
 async fn standard_input_closed(is_watched: bool) {
     if !is_watched {
         std::future::pending::<()>().await;

@@ -226,7 +226,7 @@ impl<'a> Sweep<'a> {
         let board = Board::new(&name, out, self.n_jobs, self.statuses);
         let stop = CancellationToken::new();
         let site = Site::of_sweep(board.views());
-        drop(tokio::spawn(tandem_dashboard::serve(site, access, listener, stop.clone())));
+        drop(tokio::spawn(dashboard::serve(site, access, listener, stop.clone())));
         self.board = Some(board);
         Ok(Some(stop.drop_guard()))
     }

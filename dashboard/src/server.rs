@@ -24,8 +24,8 @@ use crate::site::{Expiry, Site};
 
 /// The largest number of pages that receive events at a time. A further one gets a sentence instead.
 pub const MAX_VIEWERS: usize = 64;
-/// The largest number of connections: each page has one for events, and a few for a moment.
-const MAX_CONNECTIONS: usize = 256;
+/// The number of connections per such page: one for events, and a few for a moment.
+const CONNECTIONS_PER_VIEWER: usize = 4;
 /// The largest size of the head of a request, in bytes.
 const MAX_HEAD_BYTES: usize = 16 << 10;
 /// The age from which a connection ends with the response in progress. Browsers open another one by themselves.
@@ -33,15 +33,17 @@ const MAX_AGE: Duration = Duration::from_secs(600);
 /// Time for that response, after which the connection is dropped: a viewer that stopped reading makes room.
 const FAREWELL: Duration = Duration::from_secs(10);
 
-/// Serves `site` to the connections of `incoming` until `shutdown` is cancelled.
+/// Serves `site` to the connections of `incoming`, at most `capacity` at a time, until `shutdown` is cancelled.
 pub async fn serve(
     site: Site,
     access: Access,
     incoming: impl Into<Incoming>,
+    capacity: Capacity,
     shutdown: CancellationToken,
 ) {
-    let incoming = incoming.into().with_capacity(Capacity::of(MAX_CONNECTIONS));
-    let serving = accept(site.router(access, MAX_VIEWERS).layer(MarkRequestLayer), incoming);
+    let incoming = incoming.into().with_capacity(capacity);
+    let max_viewers = MAX_VIEWERS.min(capacity.total().div_ceil(CONNECTIONS_PER_VIEWER));
+    let serving = accept(site.router(access, max_viewers).layer(MarkRequestLayer), incoming);
     tokio::select! {
         () = serving => (),
         () = shutdown.cancelled() => (),

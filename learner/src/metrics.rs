@@ -47,32 +47,6 @@ fn add_queue(registry: &mut Registry, queue: &WorkQueue, now: Duration) {
 
 /// Adds the counters and rates of the run.
 fn add_progress(registry: &mut Registry, progress: &Progress) {
-    let labels = vec![
-        ("task", progress.task.clone()),
-        ("arms", progress.n_arms.to_string()),
-        ("strategy", progress.strategy.clone()),
-    ];
-    registry.register("run", "What is learned, and how it is advised", Info::new(labels));
-    let Counters { round, env_steps, episodes, updates, advice_spent, advice_queries } =
-        progress.counters;
-    counter(registry, "rounds", "Rounds that were learned", round);
-    counter(registry, "env_steps", "Training steps in environments", env_steps);
-    counter(registry, "episodes", "Training episodes", episodes);
-    counter(registry, "updates", "Updates of the networks", updates);
-    counter(
-        registry,
-        "advice_spent",
-        "Units of advice that learned episodes have cost",
-        advice_spent,
-    );
-    let help = "Training steps on which the teacher was asked";
-    counter(registry, "advice_queries", help, advice_queries);
-    let left = progress.budget_left as f64;
-    gauge(registry, "advice_left", "Units of advice that are left", left);
-    gauge(registry, "wall_seconds", "Seconds of the run, resumed parts added up", progress.wall_s);
-    let (steps_per_s, updates_per_s) = (progress.env_steps_per_s, progress.updates_per_s);
-    gauge(registry, "env_steps_per_second", "Training steps a second, of late", steps_per_s);
-    gauge(registry, "updates_per_second", "Updates a second, of late", updates_per_s);
     gauge(
         registry,
         "ended",
@@ -86,6 +60,50 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
         "1 while something requires an operator, see Status",
         needs_attention,
     );
+    if progress.phase.is_none() {
+        // The checkpoint is not loaded yet.
+        return;
+    }
+    let labels = vec![
+        ("task", progress.task.clone()),
+        ("arms", progress.n_arms.to_string()),
+        ("strategy", progress.strategy.clone()),
+    ];
+    registry.register("run", "What is learned, and how it is advised", Info::new(labels));
+    add_counts(registry, progress);
+    let left = progress.budget_left as f64;
+    gauge(registry, "advice_left", "Units of advice that are left", left);
+    gauge(registry, "wall_seconds", "Seconds of the run, resumed parts added up", progress.wall_s);
+    let (steps_per_s, updates_per_s) = (progress.env_steps_per_s, progress.updates_per_s);
+    gauge(registry, "env_steps_per_second", "Training steps a second, of late", steps_per_s);
+    gauge(registry, "updates_per_second", "Updates a second, of late", updates_per_s);
+}
+
+/// Returns one of the counters.
+type Count = fn(&Counters) -> u64;
+
+/// Adds what the run has done: a counter of this process, and a gauge of the run. A run that continues from a checkpoint has
+/// done less than before its learner was killed, which a counter must not show.
+fn add_counts(registry: &mut Registry, progress: &Progress) {
+    let (now, before) = (&progress.counters, &progress.counters_before);
+    let counts: [(&str, &str, Count); 6] = [
+        ("rounds", "Rounds that were learned", |counters| counters.round),
+        ("env_steps", "Training steps in environments", |counters| counters.env_steps),
+        ("episodes", "Training episodes", |counters| counters.episodes),
+        ("updates", "Updates of the networks", |counters| counters.updates),
+        ("advice_spent", "Units of advice that learned episodes have cost", |counters| {
+            counters.advice_spent
+        }),
+        ("advice_queries", "Training steps on which the teacher was asked", |counters| {
+            counters.advice_queries
+        }),
+    ];
+    for (name, help, of) in counts {
+        let help_of_process = format!("{help}, since the learner started");
+        counter(registry, name, &help_of_process, of(now).saturating_sub(of(before)));
+        let help_of_run = format!("{help}, since the run began");
+        gauge(registry, &format!("run_{name}"), &help_of_run, of(now) as f64);
+    }
 }
 
 /// Adds the checks of environments on servers, if there are any.
@@ -148,4 +166,31 @@ fn gauge(registry: &mut Registry, name: &str, help: &str, value: f64) {
 
 fn counter(registry: &mut Registry, name: &str, help: &str, value: u64) {
     registry.register(name, help, ConstCounter::new(value));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::progress::Phase;
+
+    /// Returns the lines of the page that begin with `prefix`.
+    fn lines(progress: &Progress, prefix: &str) -> Vec<String> {
+        let metrics = Metrics::new(Arc::new(|| Duration::ZERO));
+        let progress = progress.clone();
+        metrics.add_source(move |registry| add_progress(registry, &progress));
+        let page = metrics.page();
+        page.lines().filter(|line| line.starts_with(prefix)).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn counters_of_a_resumed_run_begin_at_0_once_its_checkpoint_is_loaded() {
+        let mut progress = Progress::default();
+        assert_eq!(lines(&progress, "tandem_env_steps_total"), [""; 0]);
+        assert_eq!(lines(&progress, "tandem_needs_attention "), ["tandem_needs_attention 0.0"]);
+        progress.phase = Some(Phase::Collecting);
+        progress.counters_before.env_steps = 8500;
+        progress.counters.env_steps = 8550;
+        assert_eq!(lines(&progress, "tandem_env_steps_total"), ["tandem_env_steps_total 50"]);
+        assert_eq!(lines(&progress, "tandem_run_env_steps "), ["tandem_run_env_steps 8550.0"]);
+    }
 }

@@ -14,6 +14,8 @@ pub(crate) struct Progress {
     pub(crate) strategy: String,
     /// Rounds, environment steps, episodes, updates and units of advice so far.
     pub(crate) counters: Counters,
+    /// The same when this process had loaded its checkpoint; 0 for a new run.
+    pub(crate) counters_before: Counters,
     /// Seconds of wall time at the latest change, summed over resumed parts.
     pub(crate) wall_s: f64,
     /// Seconds of wall time of the parts of the run before this process.

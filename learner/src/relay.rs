@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -19,7 +20,7 @@ use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
 use tokio::sync::OnceCell;
 use tokio_util::sync::CancellationToken;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
 
 use crate::error::Error;
 use crate::service::check_version;
@@ -44,7 +45,8 @@ pub async fn serve(
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let metrics = RelayMetrics::register(server_config.metrics());
-    let relay = Relay { client, cache: Mutex::default(), metrics };
+    let relay =
+        Relay { client, cache: Mutex::default(), metrics, is_rejected: AtomicBool::default() };
     serve_boxed(relay, server_config, incoming.into(), shutdown).await
 }
 
@@ -66,6 +68,8 @@ struct Relay {
     client: LearnerClient<AuthChannel>,
     cache: Mutex<Cache>,
     metrics: RelayMetrics,
+    /// Set while the learner rejects the relay's token, which is logged once.
+    is_rejected: AtomicBool,
 }
 
 /// The metrics of distributed parameters.
@@ -128,8 +132,35 @@ impl Relay {
         self.metrics.fetches.inc();
         let mut client = self.client.clone();
         let request = pb::GetParametersRequest { version };
-        let parameters = forward(client.get_parameters(request)).await?;
+        let parameters = self.forward(client.get_parameters(request)).await?;
         Ok(EncodedResponse::encode(parameters.get_ref()))
+    }
+
+    /// Applies the deadline to a call of the learner.
+    ///
+    /// If the learner rejects the relay's token, the call fails with `UNAVAILABLE`: the caller's own token is right,
+    /// and the call can be repeated until the relay has the learner's token.
+    async fn forward<T>(
+        &self,
+        call: impl Future<Output = Result<Response<T>, Status>>,
+    ) -> Result<Response<T>, Status> {
+        match within(CALL_DEADLINE, call).await {
+            Ok(response) => {
+                if self.is_rejected.swap(false, Ordering::Relaxed) {
+                    tracing::info!("the learner accepts the relay's token again");
+                }
+                // The headers of the learner's response, such as its date, do not apply to this one.
+                Ok(Response::new(response.into_inner()))
+            }
+            Err(status) if status.code() == Code::Unauthenticated => {
+                let reason = status.message();
+                if !self.is_rejected.swap(true, Ordering::Relaxed) {
+                    tracing::warn!(reason, "the learner rejects the relay's token, workers wait");
+                }
+                Err(Status::unavailable(format!("the relay cannot call the learner: {reason}")))
+            }
+            Err(status) => Err(status),
+        }
     }
 }
 
@@ -144,7 +175,7 @@ impl Learner for Relay {
         let request = request.into_inner();
         // A relay would drop the fields that another version has added.
         check_version(&request.worker, &request.version, "relay")?;
-        let answer = forward(self.client.clone().join(request)).await?;
+        let answer = self.forward(self.client.clone().join(request)).await?;
         self.cache().switch_to(answer.get_ref().learner);
         Ok(answer)
     }
@@ -153,7 +184,7 @@ impl Learner for Relay {
         &self,
         request: Request<pb::NextWorkRequest>,
     ) -> Result<Response<pb::NextWorkResponse>, Status> {
-        forward(self.client.clone().next_work(request.into_inner())).await
+        self.forward(self.client.clone().next_work(request.into_inner())).await
     }
 
     async fn get_parameters(
@@ -176,21 +207,21 @@ impl Learner for Relay {
         &self,
         request: Request<pb::SubmitEpisodesRequest>,
     ) -> Result<Response<pb::SubmitEpisodesResponse>, Status> {
-        forward(self.client.clone().submit_episodes(with_trace(request))).await
+        self.forward(self.client.clone().submit_episodes(with_trace(request))).await
     }
 
     async fn status(
         &self,
         request: Request<pb::StatusRequest>,
     ) -> Result<Response<pb::Progress>, Status> {
-        forward(self.client.clone().status(request.into_inner())).await
+        self.forward(self.client.clone().status(request.into_inner())).await
     }
 
     async fn watch(
         &self,
         request: Request<pb::WatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        forward(self.client.clone().watch(request.into_inner())).await
+        self.forward(self.client.clone().watch(request.into_inner())).await
     }
 }
 
@@ -202,12 +233,4 @@ fn with_trace<T>(request: Request<T>) -> Request<T> {
         forwarded.extensions_mut().insert(trace);
     }
     forwarded
-}
-
-/// Applies the deadline to a call of the learner.
-async fn forward<T>(
-    call: impl Future<Output = Result<Response<T>, Status>>,
-) -> Result<Response<T>, Status> {
-    // The headers of the learner's response, such as its date, do not apply to this one.
-    Ok(Response::new(within(CALL_DEADLINE, call).await?.into_inner()))
 }

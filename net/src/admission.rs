@@ -18,6 +18,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, Sleep};
 
+use crate::text_endpoint;
 use crate::throttle::Throttle;
 
 /// The deadline of the first request on a connection, including the TLS handshake.
@@ -31,6 +32,8 @@ const LOG_EVERY: Duration = Duration::from_secs(60);
 const MOST: usize = 16_384;
 /// The open files that a service needs besides its connections: ledger or run directory, logs, outgoing connections.
 const OTHER_FILES: usize = 64;
+/// The maximum number of connections of a dashboard.
+const MOST_OF_DASHBOARD: usize = 256;
 /// The number of connections that is reserved for unauthenticated ones.
 const RESERVE: usize = 32;
 
@@ -54,12 +57,33 @@ impl Capacity {
         Self { total, authenticated: total - reserve, unauthenticated_per_peer: total / 2 }
     }
 
-    /// Returns the capacity of a process with a limit of `limit` open files; `None` means no limit.
+    /// Returns the capacity of the service of a process with a limit of `limit` open files; `None` means no limit.
+    ///
+    /// The service leaves files to the process itself, to a dashboard and to a [`TextEndpoint`](crate::TextEndpoint),
+    /// even if it has no such pages.
     #[must_use]
     pub fn for_open_files(limit: Option<u64>) -> Self {
-        let limit = limit.and_then(|limit| usize::try_from(limit).ok()).unwrap_or(usize::MAX);
-        Self::of(limit - OTHER_FILES.min(limit / 4))
+        let pages = Self::of_dashboard(limit).total + text_endpoint::MAX_CONNECTIONS;
+        let limit = n_files(limit);
+        Self::of(limit - OTHER_FILES.min(limit / 4) - pages.min(limit / 4))
     }
+
+    /// Returns the capacity of the dashboard of a process with a limit of `limit` open files: an eighth of them, at
+    /// most 256.
+    #[must_use]
+    pub fn of_dashboard(limit: Option<u64>) -> Self {
+        Self::of((n_files(limit) / 8).min(MOST_OF_DASHBOARD))
+    }
+
+    /// Returns the limit on all connections.
+    #[must_use]
+    pub const fn total(self) -> usize {
+        self.total
+    }
+}
+
+fn n_files(limit: Option<u64>) -> usize {
+    limit.and_then(|limit| usize::try_from(limit).ok()).unwrap_or(usize::MAX)
 }
 
 impl Default for Capacity {

@@ -149,7 +149,7 @@ impl ServerConfig {
             .server()?
             .layer(MarkRequestLayer)
             .layer(NameServiceLayer::new(name_service::<S>))
-            .layer(RpcLayer { metrics: self.metrics.clone(), methods })
+            .layer(RpcLayer { metrics: self.metrics.clone(), methods, token: self.token.clone() })
             .add_service(InterceptedService::new(EncodedService(service), token.clone()))
             .add_service(health)
             .add_service(InterceptedService::new(reflection().build_v1()?, token.clone()))

@@ -22,7 +22,7 @@ use crate::incoming::Incoming;
 /// The deadline of a connection, from the first byte of the request to the last byte of the response.
 const DEADLINE: Duration = Duration::from_secs(10);
 /// The maximum number of open connections; a further one replaces the oldest connection without a request.
-const MAX_CONNECTIONS: usize = 16;
+pub(crate) const MAX_CONNECTIONS: usize = 16;
 /// The maximum size of a request, in bytes.
 const MAX_REQUEST_BYTES: usize = 16 << 10;
 

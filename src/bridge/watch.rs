@@ -217,7 +217,7 @@ impl Page {
         output::message(format_args!("dashboard on {}", dashboard::url(self.address)));
         let site = Site::of_bridge(terms, views, stop_action(operator.clone()));
         let stop = CancellationToken::new();
-        drop(tokio::spawn(tandem_dashboard::serve(site, self.access, self.listener, stop.clone())));
+        drop(tokio::spawn(dashboard::serve(site, self.access, self.listener, stop.clone())));
         stop.drop_guard()
     }
 }

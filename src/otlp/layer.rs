@@ -1,6 +1,7 @@
 //! From spans of `tracing` to spans of OpenTelemetry.
 
 use std::fmt;
+use std::time::{Duration, Instant};
 
 use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::common::v1::{AnyValue, KeyValue};
@@ -22,7 +23,11 @@ pub(crate) struct SpanLayer {
 }
 
 /// A span that is not closed yet.
-struct OpenSpan(Span);
+struct OpenSpan {
+    span: Span,
+    /// Measures the duration of the span, because the time of day may be set meanwhile.
+    start: Instant,
+}
 
 impl SpanLayer {
     pub(super) const fn new(spans: mpsc::Sender<Span>) -> Self {
@@ -39,9 +44,9 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for SpanLayer {
     fn on_new_span(&self, attributes: &Attributes<'_>, id: &Id, context: Context<'_, S>) {
         let mut fields = Fields::default();
         attributes.record(&mut fields);
-        if let Some(span) = context.span(id) {
-            let open = Span { start_time_unix_nano: clock::unix_nanos(), ..fields.span };
-            span.extensions_mut().insert(OpenSpan(open));
+        if let Some(context) = context.span(id) {
+            let span = Span { start_time_unix_nano: clock::unix_nanos(), ..fields.span };
+            context.extensions_mut().insert(OpenSpan { span, start: clock::now() });
         }
     }
 
@@ -49,18 +54,25 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for SpanLayer {
         let mut fields = Fields::default();
         values.record(&mut fields);
         if let Some(span) = context.span(id)
-            && let Some(OpenSpan(open)) = span.extensions_mut().get_mut::<OpenSpan>()
+            && let Some(open) = span.extensions_mut().get_mut::<OpenSpan>()
         {
-            open.attributes.append(&mut fields.span.attributes);
+            open.span.attributes.append(&mut fields.span.attributes);
         }
     }
 
     fn on_close(&self, id: Id, context: Context<'_, S>) {
         let Some(span) = context.span(&id) else { return };
-        let Some(OpenSpan(open)) = span.extensions_mut().remove::<OpenSpan>() else { return };
+        let Some(open) = span.extensions_mut().remove::<OpenSpan>() else { return };
         // Fails if the collector is away or too slow.
-        drop(self.spans.try_send(Span { end_time_unix_nano: clock::unix_nanos(), ..open }));
+        drop(self.spans.try_send(closed_after(open.start.elapsed(), open.span)));
     }
+}
+
+/// Returns `span` with the end that it has after `duration`.
+fn closed_after(duration: Duration, span: Span) -> Span {
+    let n_nanos = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
+    let end_time_unix_nano = span.start_time_unix_nano.saturating_add(n_nanos);
+    Span { end_time_unix_nano, ..span }
 }
 
 /// The fields of a span.
@@ -113,4 +125,16 @@ fn kind_of(name: &str) -> SpanKind {
 /// Returns a value that is a text.
 pub(super) const fn text(text: String) -> AnyValue {
     AnyValue { value: Some(Value::StringValue(text)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_span_ends_its_duration_after_its_start() {
+        let open = Span { start_time_unix_nano: 5_000_000_000, ..Span::default() };
+        let closed = closed_after(Duration::from_millis(3), open);
+        assert_eq!(closed.end_time_unix_nano, 5_003_000_000);
+    }
 }

@@ -110,8 +110,7 @@ impl Page {
         tracing::info!("{line}");
         if let Ok((listener, _)) = self.bound {
             let site = Site::of_run(self.views);
-            let served = tandem_dashboard::serve(site, self.access, listener, stop.clone());
-            drop(tokio::spawn(served));
+            drop(tokio::spawn(dashboard::serve(site, self.access, listener, stop.clone())));
         }
         stop.drop_guard()
     }

@@ -25,11 +25,15 @@ struct Served {
 
 impl Served {
     async fn start(access: Access) -> Self {
+        Self::start_within(Capacity::of_dashboard(None), access).await
+    }
+
+    async fn start_within(capacity: Capacity, access: Access) -> Self {
         let (views, receiver) = watch::channel(RunView::default());
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
         let shutdown = CancellationToken::new();
-        let served = serve(Site::of_run(receiver), access, listener, shutdown.clone());
+        let served = serve(Site::of_run(receiver), access, listener, capacity, shutdown.clone());
         drop(tokio::spawn(served));
         Self { address, views, shutdown }
     }
@@ -169,6 +173,19 @@ async fn a_further_viewer_gets_a_sentence_and_the_others_are_served() {
 }
 
 #[tokio::test]
+async fn with_few_connections_there_are_few_viewers() {
+    let served = Served::start_within(Capacity::of_dashboard(Some(64)), Access::local()).await;
+    let mut viewers = Vec::new();
+    for _ in 0..2 {
+        let mut viewer = served.send("GET /events", "").await;
+        until(&mut viewer, "data: ").await;
+        viewers.push(viewer);
+    }
+    has_status(&served.ask("GET /events", "").await, 503);
+    has_status(&served.ask("GET /state", "").await, 200);
+}
+
+#[tokio::test]
 async fn a_token_is_exchanged_for_a_cookie() {
     let token = Token::new("0123456789abcdef").expect("a token");
     let served = Served::start(Access::with_token(token)).await;
@@ -220,7 +237,13 @@ async fn only_the_page_itself_and_programs_can_stop_the_arms_of_a_bridge() {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("bound");
     let shutdown = CancellationToken::new();
-    drop(tokio::spawn(serve(site, Access::local(), listener, shutdown.clone())));
+    drop(tokio::spawn(serve(
+        site,
+        Access::local(),
+        listener,
+        Capacity::of_dashboard(None),
+        shutdown.clone(),
+    )));
     let served = Served { address, views: watch::channel(RunView::default()).0, shutdown };
     let action = "x-tandem-action: stop\r\ncontent-length: 0\r\n";
     for refused in ["content-length: 0\r\n", &format!("{action}origin: http://evil.example\r\n")] {

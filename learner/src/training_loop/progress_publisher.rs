@@ -68,6 +68,9 @@ impl<'a> ProgressPublisher<'a> {
         let workers = workers(&state.queue);
         drop(state);
         self.shared.progress.send_modify(|progress| {
+            if progress.phase.is_none() {
+                progress.counters_before = counters;
+            }
             progress.task.clone_from(&run.task);
             progress.n_arms = run.arms;
             progress.strategy.clone_from(&run.advice.strategy);

@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tandem_net::{ClientConfig, ServerConfig};
+use tandem_net::{ClientConfig, ServerConfig, Token};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::learner_server::{Learner, LearnerServer};
@@ -29,12 +29,18 @@ async fn bound() -> (TcpListener, SocketAddr) {
 
 /// Starts a relay to `learner`; gives its address and what ends it.
 async fn relay(learner: SocketAddr) -> (SocketAddr, tokio_util::sync::DropGuard) {
+    relay_with(ClientConfig::default(), learner).await
+}
+
+async fn relay_with(
+    client_config: ClientConfig,
+    learner: SocketAddr,
+) -> (SocketAddr, tokio_util::sync::DropGuard) {
     let (listener, address) = bound().await;
     let shutdown = CancellationToken::new();
     let guard = shutdown.clone().drop_guard();
     tokio::spawn(async move {
-        let (learner, client_config, server_config) =
-            (learner.to_string(), ClientConfig::default(), ServerConfig::default());
+        let (learner, server_config) = (learner.to_string(), ServerConfig::default());
         let served = tandem_learner::relay::serve(
             &learner,
             &client_config,
@@ -149,8 +155,12 @@ impl Learner for Fake {
 
 impl Fake {
     async fn serve(&self) -> SocketAddr {
+        self.serve_with(ServerConfig::default()).await
+    }
+
+    async fn serve_with(&self, config: ServerConfig) -> SocketAddr {
         let (listener, address) = bound().await;
-        let router = ServerConfig::default()
+        let router = config
             .router(LearnerServer::new(self.clone()), tandem_proto::FILE_DESCRIPTOR_SET)
             .await
             .expect("serves");
@@ -243,4 +253,23 @@ async fn an_absent_learner_is_reported() {
     let status = parameters(&client(address).await, 0).await.expect_err("no learner listens");
     assert_eq!(status.code(), Code::Unavailable);
     assert!(status.message().contains(&absent.to_string()), "{}", status.message());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_relay_with_another_token_than_the_learner_does_not_end_its_workers() {
+    let token = |text| Token::new(text).expect("a token");
+    let required = ServerConfig::default().with_token(token("the-right-token-0123"));
+    let learner = Fake::default().serve_with(required).await;
+    let rejected = ClientConfig::default().with_token(&token("another-token-456789"));
+    let (address, _relay) = relay_with(rejected, learner).await;
+    let worker = ClientConfig::default().channel(&address.to_string()).expect("an address");
+    let mut worker = LearnerClient::new(worker);
+    let of_work = worker.next_work(pb::NextWorkRequest { worker_id: 7 }).await.map(drop);
+    let of_parameters =
+        worker.get_parameters(pb::GetParametersRequest { version: 0 }).await.map(drop);
+    for status in [of_work, of_parameters].map(|answer| answer.expect_err("rejected")) {
+        assert_eq!(status.code(), Code::Unavailable);
+        let expected = format!("the relay cannot call the learner: {learner} does not accept");
+        assert!(status.message().starts_with(&expected), "{}", status.message());
+    }
 }

@@ -23,12 +23,27 @@ fn the_capacity_reserves_files_and_unauthenticated_connections() {
         assert_eq!((capacity.total, capacity.authenticated), (total, authenticated), "{limit:?}");
     };
     check(Some(0), 2, 1);
-    check(Some(8), 6, 5);
-    check(Some(256), 192, 168);
-    check(Some(1024), 960, 928);
+    check(Some(8), 4, 3);
+    check(Some(256), 144, 126);
+    check(Some(1024), 816, 784);
     check(Some(1_048_576), MOST, MOST - RESERVE);
     check(Some(u64::MAX), MOST, MOST - RESERVE);
     check(None, MOST, MOST - RESERVE);
+}
+
+#[test]
+fn all_connections_of_a_process_leave_it_files_of_its_own() {
+    let check = |limit: usize, of_dashboard| {
+        let files = u64::try_from(limit).ok();
+        let dashboard = Capacity::of_dashboard(files).total;
+        assert_eq!(dashboard, of_dashboard, "{limit}");
+        let service = Capacity::for_open_files(files).total;
+        let n_files = service + dashboard + text_endpoint::MAX_CONNECTIONS + OTHER_FILES;
+        assert!(n_files <= limit, "{n_files} of {limit}");
+    };
+    check(256, 32);
+    check(1024, 128);
+    check(65_536, 256);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use http::HeaderMap;
+use http::header::AUTHORIZATION;
 use hyper::body::{Body as HttpBody, Bytes, Frame, SizeHint};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
@@ -20,6 +21,7 @@ use tower::{Layer, Service};
 use tracing::{Instrument as _, Span};
 
 use super::{LATENCY_BUCKETS_S, Metrics};
+use crate::access::Token;
 use crate::trace::TraceContext;
 
 /// The name in labels of a call that the service does not have. Clients may call any path.
@@ -237,11 +239,14 @@ const fn code_name(code: Code) -> &'static str {
     }
 }
 
-/// A layer that measures the calls of a service, and gives each call with a trace context a span of its own.
+/// A layer that measures the calls of a service, and gives each authenticated call with a trace context a span of its
+/// own.
 #[derive(Debug, Clone)]
 pub struct RpcLayer {
     pub(crate) metrics: Metrics,
     pub(crate) methods: Methods,
+    /// The token of the service, if calls require one.
+    pub(crate) token: Option<Token>,
 }
 
 /// The service that [`RpcLayer`] makes.
@@ -275,21 +280,30 @@ where
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
         let labels = self.layer.methods.labels(request.uri().path());
         let call = MeasuredCall::start(&self.layer.metrics, Side::Server, labels);
-        let span = server_span(&mut request, call.method());
+        let span = self.layer.server_span(&mut request, call.method());
         let response = self.service.call(request).instrument(span);
         Box::pin(async move { Ok(call.measure(response.await?)) })
     }
 }
 
-/// Returns the span of a call, and adds its trace context to the extensions of the request. A call without a trace
-/// context has no span.
-fn server_span<B>(request: &mut http::Request<B>, method: &str) -> Span {
-    let Some(parent) = TraceContext::from_headers(request.headers()) else { return Span::none() };
-    let trace = parent.child("server", 0);
-    request.extensions_mut().insert(trace);
-    let span = trace.span(Some(parent), method, "server");
-    span.in_scope(|| tracing::debug!("call received"));
-    span
+impl RpcLayer {
+    /// Returns the span of a call, and adds its trace context to the extensions of the request. A call without a trace
+    /// context or without the service's token has no span.
+    fn server_span<B>(&self, request: &mut http::Request<B>, method: &str) -> Span {
+        let headers = request.headers();
+        let parent = TraceContext::from_headers(headers).filter(|_| self.is_authenticated(headers));
+        let Some(parent) = parent else { return Span::none() };
+        let trace = parent.child("server", 0);
+        request.extensions_mut().insert(trace);
+        let span = trace.span(Some(parent), method, "server");
+        span.in_scope(|| tracing::debug!("call received"));
+        span
+    }
+
+    fn is_authenticated(&self, headers: &HeaderMap) -> bool {
+        let Some(token) = &self.token else { return true };
+        headers.get(AUTHORIZATION).is_some_and(|header| token.matches(header.as_bytes()))
+    }
 }
 
 #[cfg(test)]
@@ -307,6 +321,28 @@ mod tests {
         for path in ["/grpc.health.v1.Health/Check2", "/", "", "/a/b/c", "//"] {
             assert_eq!(names(path), "unknown unknown", "{path:?}");
         }
+    }
+
+    #[test]
+    fn only_authenticated_calls_have_spans() {
+        let token = Token::new("0123456789abcdef").expect("a token");
+        let check = |token: Option<&Token>, authorization: Option<&str>, expected| {
+            let (metrics, methods) = (Metrics::default(), Methods::default());
+            let layer = RpcLayer { metrics, methods, token: token.cloned() };
+            let mut request = http::Request::new(());
+            TraceContext::of(&[1]).add_to(request.headers_mut());
+            if let Some(authorization) = authorization {
+                let value = authorization.parse().expect("a header");
+                request.headers_mut().insert(AUTHORIZATION, value);
+            }
+            let span = layer.server_span(&mut request, "Advise");
+            let has_trace = request.extensions().get::<TraceContext>().is_some();
+            assert_eq!((!span.is_none(), has_trace), (expected, expected), "{authorization:?}");
+        };
+        check(None, None, true);
+        check(Some(&token), None, false);
+        check(Some(&token), Some("Bearer 0123456789abcdeF"), false);
+        check(Some(&token), Some(&token.header()), true);
     }
 
     #[test]
