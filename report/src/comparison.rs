@@ -166,7 +166,7 @@ impl Section {
     /// Returns the measures of the paper's Table 2.
     fn measures(&self) -> Table {
         let title =
-            format!("{}: measures of the paper's Table 2, in its epochs", self.setup.title());
+            format!("{}: measures of the paper's Table 2, in the runs' epochs", self.setup.title());
         let mut table = Table::new(title, &["strategy", "runs", "IE", "RT", "MSR", "ELR"]);
         for group in &self.groups {
             table.rows.push(vec![
@@ -233,7 +233,8 @@ impl Section {
         table
     }
 
-    /// Returns the success, with intervals, of the last and the best evaluation and of the best policy on test goals.
+    /// Returns the success, with intervals, of the policies that the runs kept, on test goals and on the goals that selected
+    /// them, and of the last evaluation.
     fn success(&self) -> Table {
         let title = format!("{}: success of the policy alone [95 % interval]", self.setup.title());
         let header = [
@@ -241,7 +242,7 @@ impl Section {
             "env steps",
             "test goals",
             "without arm contact",
-            "best evaluation",
+            "kept policy",
             "last evaluation",
             "joint goal",
             "contacts",
@@ -272,7 +273,7 @@ fn test_success(run: &Run) -> Option<(f64, u64)> {
     run.test.as_ref().map(|test| (test.success, test.n_episodes))
 }
 
-/// Returns the success of the best evaluation and the number of its episodes.
+/// Returns the success of the policy that a run kept, on the goals that selected it, and the number of its episodes.
 fn best_success(run: &Run) -> Option<(f64, u64)> {
     run.best().map(|row| (row.success, row.n_episodes))
 }

@@ -10,10 +10,11 @@ use crate::quantity::Quantity;
 use crate::table::{NONE, Table, mean, optional, short_number};
 
 impl Section {
-    /// Returns the success on test goals with its interval, and that of the best evaluation.
+    /// Returns the success on test goals with its interval, and that of the policies that the runs kept, on the goals that selected
+    /// them.
     pub(super) fn success_summary(&self) -> Table {
         let title = format!("{}: success of the policy alone, on test goals", self.setup.title());
-        let header = ["strategy", "runs", "success", "95 % interval", "no contact", "best eval."];
+        let header = ["strategy", "runs", "success", "95 % interval", "no contact", "kept policy"];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
             let (test, interval) = group.share(test_success);
