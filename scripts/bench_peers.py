@@ -11,7 +11,9 @@ import json
 import os
 import statistics
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
@@ -91,13 +93,19 @@ def torch_update():
 
 def tandem(program):
     """Returns Tandem's figures by name."""
-    output = subprocess.run([program, "bench", "sim", "update", "--json"], check=True, capture_output=True, text=True)
+    try:
+        output = subprocess.run([program, "bench", "sim", "update", "--json"], stdout=subprocess.PIPE, text=True)
+    except OSError as error:
+        sys.exit(f"bench_peers: cannot run {program}: {error.strerror}; cargo build --release makes it")
+    if output.returncode != 0:
+        sys.exit(f"bench_peers: {program} bench ended with exit code {output.returncode}")
     return {row["name"]: row["value"] for row in map(json.loads, output.stdout.splitlines())}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tandem", default="target/release/tandem")
+    program = Path(__file__).resolve().parents[1] / "target/release/tandem"
+    parser.add_argument("--tandem", default=str(program), help="the program [default: that of this checkout]")
     parser.add_argument("--rounds", type=int, default=3)
     args = parser.parse_args()
     peers = {

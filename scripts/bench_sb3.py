@@ -178,6 +178,14 @@ def write_progress(run, rows):
         writer.writerows(rows)
 
 
+def positive(text):
+    """Parses a whole number above 0."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, got {number}")
+    return number
+
+
 def parse():
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -188,13 +196,13 @@ def parse():
     parser.add_argument("--out", type=Path, required=True, metavar="DIRECTORY", help="directory of the run")
     parser.add_argument("--resume", action="store_true", help="continue the run in DIRECTORY with its own settings")
     parser.add_argument("--max-hours", type=float, default=3.0, help="wall-clock limit of the run [default: 3]")
-    parser.add_argument("--max-env-steps", type=int, default=1_000_000, help="[default: 1000000]")
-    parser.add_argument("--evaluate-every", type=int, default=5000, metavar="N", help="env steps [default: 5000]")
-    parser.add_argument("--evaluation-episodes", type=int, default=100, metavar="N", help="[default: 100]")
+    parser.add_argument("--max-env-steps", type=positive, default=1_000_000, help="[default: 1000000]")
+    parser.add_argument("--evaluate-every", type=positive, default=5000, metavar="N", help="env steps [default: 5000]")
+    parser.add_argument("--evaluation-episodes", type=positive, default=100, metavar="N", help="[default: 100]")
     parser.add_argument(
         "--evaluation-seed", type=int, default=777_000, metavar="S", help="of the first [default: 777000]"
     )
-    parser.add_argument("--save-every", type=int, default=50_000, metavar="N", help="env steps [default: 50000]")
+    parser.add_argument("--save-every", type=positive, default=50_000, metavar="N", help="env steps [default: 50000]")
     parser.add_argument("--device", default="auto", help="torch device [default: auto]")
     return parser.parse_args()
 

@@ -21,7 +21,7 @@ EXAMPLES = """examples:
   python scripts/plot_benchmarks.py runs/fetch-push-1 runs/sb3/tqc-push-1
   python scripts/plot_benchmarks.py runs/* --x minutes --out curves.svg
   python scripts/plot_benchmarks.py docs/results/benchmarks/*
-  python scripts/plot_benchmarks.py docs/results/from-scratch/push-none-seed1 --json
+  python scripts/plot_benchmarks.py docs/results/from-scratch-classic/push-none-seed1 --json
 """
 
 
@@ -44,6 +44,9 @@ def read(file):
     """The evaluations of a run, in order: dictionaries with those of KEYS that the file has."""
     try:
         rows = [row for row in rows_of(file) if row.get("success") not in (None, "")]
+        for row in rows:
+            if missing := {"env_steps", "wall_s"} - row.keys():
+                raise Wrong(f"cannot read {file}: it has no {' and no '.join(sorted(missing))}")
         runs = [{key: float(row[key]) for key in KEYS if row.get(key) not in (None, "")} for row in rows]
         processor = file.parent / "processor.csv"
         if processor.is_file():
@@ -117,7 +120,8 @@ def success_text(values):
     """Success with its interval, in one cell of the table."""
     if values is None:
         return "–"
-    interval = "" if values["success_low"] is None else f" [{values['success_low']:.3f}, {values['success_high']:.3f}]"
+    low, high = values["success_low"], values["success_high"]
+    interval = "" if low is None or high is None else f" [{low:.3f}, {high:.3f}]"
     return f"{values['success']:.3f}{interval}"
 
 
