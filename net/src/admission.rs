@@ -18,7 +18,6 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, Sleep};
 
-use crate::text_endpoint;
 use crate::throttle::Throttle;
 
 /// The deadline of the first request on a connection, including the TLS handshake.
@@ -32,6 +31,9 @@ const LOG_EVERY: Duration = Duration::from_secs(60);
 const MOST: usize = 16_384;
 /// The open files that a service needs besides its connections: ledger or run directory, logs, outgoing connections.
 const OTHER_FILES: usize = 64;
+/// The maximum number of connections of a [`TextEndpoint`](crate::TextEndpoint); a further one replaces the oldest one
+/// without a request.
+pub(crate) const MOST_OF_TEXT: usize = 16;
 /// The maximum number of connections of a dashboard.
 const MOST_OF_DASHBOARD: usize = 256;
 /// The number of connections that is reserved for unauthenticated ones.
@@ -63,7 +65,7 @@ impl Capacity {
     /// even if it has no such pages.
     #[must_use]
     pub fn for_open_files(limit: Option<u64>) -> Self {
-        let pages = Self::of_dashboard(limit).total + text_endpoint::MAX_CONNECTIONS;
+        let pages = Self::of_dashboard(limit).total + MOST_OF_TEXT;
         let limit = n_files(limit);
         Self::of(limit - OTHER_FILES.min(limit / 4) - pages.min(limit / 4))
     }

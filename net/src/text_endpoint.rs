@@ -15,14 +15,12 @@ use tokio::task::JoinSet;
 use tokio_stream::StreamExt as _;
 use tonic::transport::server::Connected as _;
 
-use crate::admission::Capacity;
+use crate::admission::{Capacity, MOST_OF_TEXT};
 use crate::connection::Connection;
 use crate::incoming::Incoming;
 
 /// The deadline of a connection, from the first byte of the request to the last byte of the response.
 const DEADLINE: Duration = Duration::from_secs(10);
-/// The maximum number of open connections; a further one replaces the oldest connection without a request.
-pub(crate) const MAX_CONNECTIONS: usize = 16;
 /// The maximum size of a request, in bytes.
 const MAX_REQUEST_BYTES: usize = 16 << 10;
 
@@ -40,7 +38,7 @@ pub struct TextEndpoint {
 impl TextEndpoint {
     /// Serves the text to all connections of `incoming`, until that stream ends.
     pub async fn serve(self, incoming: impl Into<Incoming>) {
-        let mut incoming = incoming.into().with_capacity(Capacity::of(MAX_CONNECTIONS));
+        let mut incoming = incoming.into().with_capacity(Capacity::of(MOST_OF_TEXT));
         let mut connections = JoinSet::new();
         loop {
             tokio::select! {
@@ -117,7 +115,7 @@ mod tests {
         let address = listener.local_addr().expect("bound");
         let serving = tokio::spawn(endpoint.serve(listener));
         let mut silent = Vec::new();
-        for _ in 0..2 * MAX_CONNECTIONS {
+        for _ in 0..2 * MOST_OF_TEXT {
             silent.push(TcpStream::connect(address).await.expect("taken in"));
         }
         let mut responses = Vec::new();

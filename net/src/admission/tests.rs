@@ -38,7 +38,7 @@ fn all_connections_of_a_process_leave_it_files_of_its_own() {
         let dashboard = Capacity::of_dashboard(files).total;
         assert_eq!(dashboard, of_dashboard, "{limit}");
         let service = Capacity::for_open_files(files).total;
-        let n_files = service + dashboard + text_endpoint::MAX_CONNECTIONS + OTHER_FILES;
+        let n_files = service + dashboard + MOST_OF_TEXT + OTHER_FILES;
         assert!(n_files <= limit, "{n_files} of {limit}");
     };
     check(256, 32);
