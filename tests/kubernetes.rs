@@ -119,7 +119,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     let figures =
         cluster.wait_for_figures("learner-0", |figures| figures.get("tandem_ended") == Some(&1.0));
     assert!(rounds(&figures) > rounds(&before));
-    assert_eq!(figures["tandem_env_steps_total"], ENV_STEPS as f64);
+    assert_eq!(figures["tandem_run_env_steps"], ENV_STEPS as f64);
     let (spent, left) = account(&cluster, "teacher-0", "push");
     assert!(spent > 0);
     assert_eq!(figures["tandem_advice_spent_total"], spent as f64);
