@@ -100,7 +100,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     cluster.wait_until_ready();
 
     let rounds = |figures: &BTreeMap<String, f64>| {
-        figures.get("tandem_rounds_total").copied().unwrap_or_default()
+        figures.get("tandem_run_rounds").copied().unwrap_or_default()
     };
     let before = cluster.wait_for_figures("learner-0", |figures| rounds(figures) >= 2.0);
     assert_eq!(before["tandem_ended"], 0.0, "the run ended before the first disturbance");
@@ -122,7 +122,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     assert_eq!(figures["tandem_run_env_steps"], ENV_STEPS as f64);
     let (spent, left) = account(&cluster, "teacher-0", "push");
     assert!(spent > 0);
-    assert_eq!(figures["tandem_advice_spent_total"], spent as f64);
+    assert_eq!(figures["tandem_run_advice_spent"], spent as f64);
     assert_eq!(figures["tandem_advice_left"], left as f64);
 
     for worker in ["worker-0", "worker-1"] {
