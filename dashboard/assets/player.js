@@ -13,6 +13,8 @@ const MIN_GAP_M = 0.012;
 export class Player {
   constructor() {
     this.playback = null;
+    /** The latest evaluation, `null` if it is shown: it waits until the episode that is shown has ended. */
+    this.next = null;
     this.step = 0;
     this.playing = false;
     /** Whether the viewer has paused: then nothing moves until the viewer asks for it. */
@@ -30,10 +32,23 @@ export class Player {
     byId("episode-choice").addEventListener("change", (event) => this.choose(Number(event.target.value)));
   }
 
-  /** Shows the episodes of an evaluation, `null` if it has none that can be shown. Those that are shown already go on. */
+  /**
+   * Shows the episodes of an evaluation, `null` if it has none that can be shown. An episode that plays comes to its end
+   * first, and one that the viewer has paused stays: evaluations can follow one another faster than an episode plays.
+   */
   load(playback) {
+    if (playback && this.episode && (this.playing || this.isHeld)) {
+      this.next = JSON.stringify(playback) === JSON.stringify(this.playback) ? null : playback;
+      this.seek(this.step);
+      return;
+    }
     if (playback && JSON.stringify(playback) === JSON.stringify(this.playback)) return;
+    this.show(playback);
+  }
+
+  show(playback) {
     this.playback = playback;
+    this.next = null;
     byId("player").hidden = !playback;
     byId("episode-note").hidden = Boolean(playback);
     if (!playback) {
@@ -51,17 +66,22 @@ export class Player {
 
   choose(idx) {
     this.episode = this.playback.episodes[idx];
-    byId("step").max = this.episode.steps.length - 1;
+    byId("step").max = this.last();
     this.views = [this.view("view-above", 1), this.view("view-side", 2)];
     this.seek(0);
+    this.playing = false;
     if (this.isHeld || matchMedia("(prefers-reduced-motion: reduce)").matches) this.pause();
     else this.start();
   }
 
   start() {
     if (!this.episode) return;
-    const last = this.episode.steps.length - 1;
-    if (this.step >= last) this.seek(0);
+    if (this.step >= this.last()) {
+      if (this.next) this.show(this.next);
+      else this.seek(0);
+    }
+    if (this.playing) return;
+    const last = this.last();
     this.playing = true;
     setText(byId("play"), "Pause");
     const stepMs = Math.max(MIN_STEP_MS, 1000 * this.playback.step_s);
@@ -71,9 +91,15 @@ export class Player {
       const step = from.step + Math.max(0, now - from.at) / stepMs;
       this.seek(Math.min(step, last));
       if (step < last) requestAnimationFrame(frame);
+      else if (this.next) this.show(this.next);
       else this.pause();
     };
     requestAnimationFrame(frame);
+  }
+
+  /** Returns the last step of the episode. */
+  last() {
+    return this.episode.steps.length - 1;
   }
 
   pause() {
@@ -91,9 +117,10 @@ export class Player {
     if (Number(slider.value) !== whole) slider.value = whole;
     const reached = parts.filter((part) => part.at_goal).length;
     const touching = this.episode.contacts.includes(whole) ? ", arms touch" : "";
-    const text = `Step ${whole} of ${this.episode.steps.length - 1}: ${reached} of ${parts.length} at the goal${touching}`;
+    const text = `Step ${whole} of ${this.last()}: ${reached} of ${parts.length} at the goal${touching}`;
     slider.setAttribute("aria-valuetext", text);
-    setText(byId("episode-text"), `${text}. Policy of round ${this.playback.round}.`);
+    const next = this.next ? ` The evaluation of round ${this.next.round} follows.` : "";
+    setText(byId("episode-text"), `${text}. Policy of round ${this.playback.round}.${next}`);
   }
 
   between(whole, share) {

@@ -155,8 +155,10 @@ def check_episode(page):
     assert text.startswith("Step 3 of 50"), text
     shapes = page.value("['view-above', 'view-side'].map(id => document.querySelectorAll(`#${id} .object`).length)")
     assert shapes == [2, 2], shapes
+    page.wait("document.getElementById('episode-text').textContent.includes('follows')", "a further evaluation waits")
     page.value("document.getElementById('play').click()")
     page.wait("document.getElementById('step').value > 5", "the episode plays")
+    page.wait("document.getElementById('step').value < 5", "the further evaluation follows")
 
 
 RAISED = """{ round: 1, step_s: 0.04, tolerance_m: 0.05, is_cube: false, bases: [[-0.3, 0, 0], [0.3, 0, 0]], episodes: [{
@@ -189,19 +191,27 @@ def check_drawings(page):
 
 
 def check_pause(page):
-    """An episode that is loaded again keeps its place, and a further one does not move for a viewer who has paused."""
+    """An episode keeps its place while it plays and while the viewer has paused; the latest evaluation follows it."""
     kept = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
-      const player = new Player(), raised = {RAISED};
+      const player = new Player(), raised = {RAISED}, [episode] = raised.episodes;
+      episode.steps = Array(4).fill(episode.steps[0]);
       player.load(raised);
       player.pause();
       player.isHeld = true;
       player.step = 0.5;
       player.load(structuredClone(raised));
-      const step = player.step;
+      const paused = [player.step, player.playing];
       player.load({{ ...raised, round: 2 }});
-      return [step, player.step, player.playing];
+      paused.push(player.step, player.playback.round);
+      player.isHeld = false;
+      player.start();
+      player.load({{ ...raised, round: 3 }});
+      paused.push(player.step, player.playback.round, player.playing);
+      return new Promise(resolve => setInterval(() => {{
+        if (player.playback.round !== 1) resolve([...paused, player.playback.round]);
+      }}, 20));
     }})""")
-    assert kept == [0.5, 0, False], kept
+    assert kept == [0.5, False, 0.5, 1, 0.5, 1, True, 3], kept
     text = page.value("""import('/assets/common.js').then(({ showLink }) => {
       const element = document.createElement('span');
       showLink(element, 'live', null, 25_000);
