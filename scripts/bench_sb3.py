@@ -33,6 +33,7 @@ EXAMPLES = """examples:
   python scripts/bench_sb3.py --algorithm tqc --env FetchPush-v4 --out runs/sb3/tqc-push-1 --max-hours 3
   python scripts/bench_sb3.py --algorithm ddpg --env FetchPickAndPlace-v4 --seed 2 --out runs/sb3/ddpg-pick-2
   python scripts/bench_sb3.py --resume --out runs/sb3/tqc-push-1 --max-hours 6
+  python scripts/bench_sb3.py --starts --env FetchPush-v4     counts the goals that an idle arm has achieved already
 
 settings:
   tqc   RL Baselines3 Zoo, hyperparams/tqc.yml, FetchPush-v1 and FetchPickAndPlace-v1: 3 x 512, batch 2048 (1024 for
@@ -76,6 +77,13 @@ def make_model(algorithm, env, env_id, seed, device):
     )
 
 
+def make_env(env_id):
+    try:
+        return gymnasium.make(env_id)
+    except gymnasium.error.Error as error:
+        sys.exit(f"bench_sb3: {error}")
+
+
 def processor_s():
     """Processor seconds of this process and of its children that have ended."""
     times = os.times()
@@ -102,6 +110,16 @@ def evaluate(model, env, n_episodes, first_seed):
             observation, _, terminated, truncated, info = env.step(action)
             over = terminated or truncated
         hits += bool(info["is_success"])
+    return hits
+
+
+def count_starts(env, n_episodes, first_seed):
+    """The number of evaluation episodes whose goal is achieved at the start."""
+    hits = 0
+    for seed in range(first_seed, first_seed + n_episodes):
+        observation, info = env.reset(seed=seed)
+        # The reward of these environments is 0 at the goal and -1 elsewhere.
+        hits += bool(env.unwrapped.compute_reward(observation["achieved_goal"], observation["desired_goal"], info) >= 0)
     return hits
 
 
@@ -193,7 +211,8 @@ def parse():
     parser.add_argument("--algorithm", choices=("tqc", "ddpg"), default="tqc", help="[default: tqc]")
     parser.add_argument("--env", default="FetchPush-v4", help="Gymnasium id [default: FetchPush-v4]")
     parser.add_argument("--seed", type=int, default=1, help="seed of training [default: 1]")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIRECTORY", help="directory of the run")
+    parser.add_argument("--out", type=Path, metavar="DIRECTORY", help="directory of the run")
+    parser.add_argument("--starts", action="store_true", help="count the goals achieved at the start, and train nothing")
     parser.add_argument("--resume", action="store_true", help="continue the run in DIRECTORY with its own settings")
     parser.add_argument("--max-hours", type=float, default=3.0, help="wall-clock limit of the run [default: 3]")
     parser.add_argument("--max-env-steps", type=positive, default=1_000_000, help="[default: 1000000]")
@@ -204,11 +223,19 @@ def parse():
     )
     parser.add_argument("--save-every", type=positive, default=50_000, metavar="N", help="env steps [default: 50000]")
     parser.add_argument("--device", default="auto", help="torch device [default: auto]")
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    if not (arguments.out or arguments.starts):
+        parser.error("a run needs --out DIRECTORY")
+    return arguments
 
 
 def main():
     arguments, clocks = parse(), {"wall_s": 0.0}
+    if arguments.starts:
+        n = arguments.evaluation_episodes
+        n_achieved = count_starts(make_env(arguments.env), n, arguments.evaluation_seed)
+        print(f"{arguments.env}: {n_achieved} of {n} evaluation goals are achieved at the start")
+        return
     run = arguments.out
     if arguments.resume:
         state = resume(run)
@@ -221,10 +248,7 @@ def main():
             sys.exit(f"bench_sb3: {progress} is of a run that was never saved: delete it, or choose another directory")
         names = "algorithm env seed evaluate_every evaluation_episodes evaluation_seed save_every"
         settings = {name: getattr(arguments, name) for name in names.split()}
-    try:
-        env, evaluation_env = gymnasium.make(settings["env"]), gymnasium.make(settings["env"])
-    except gymnasium.error.Error as error:
-        sys.exit(f"bench_sb3: {error}")
+    env, evaluation_env = make_env(settings["env"]), make_env(settings["env"])
     if not arguments.resume:
         run.mkdir(parents=True, exist_ok=True)
         write_progress(run, [])
