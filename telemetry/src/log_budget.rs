@@ -1,5 +1,6 @@
 //! A size limit on the logs in a directory.
 
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use crate::error::Error;
@@ -12,8 +13,9 @@ const MAX_WRITERS: u64 = 16;
 /// Keeps the logs of episodes and motions in a directory below a size by deleting the oldest ones.
 ///
 /// Logs of training episodes are deleted first, those of evaluations only when no others are left; within a kind, the
-/// lowest parameter version and then the lowest episode number is the oldest, and for motions the date and the number. Incomplete logs (`NAME.mcap.part`) count
-/// as well. Files with other names are neither counted nor deleted.
+/// lowest parameter version and then the lowest episode number is the oldest, and for motions the date and the number.
+/// Incomplete logs (`NAME.mcap.part`) count as well, but those that are being written are not deleted. Files with other
+/// names are neither counted nor deleted.
 ///
 /// Several processes may write to the directory, each with its own value of this type.
 #[derive(Debug)]
@@ -59,6 +61,9 @@ impl LogBudget {
             for log in logs {
                 if occupied <= kept {
                     break;
+                }
+                if is_being_written(&log.path) {
+                    continue;
                 }
                 delete(&log.path)?;
                 occupied -= log.n_bytes;
@@ -112,6 +117,13 @@ fn parse_name(name: &str) -> Option<(bool, u64, u64)> {
     parts.next().is_none().then_some((is_evaluation, numbers.0, numbers.1))
 }
 
+/// Returns whether a writer holds the lock of an incomplete log.
+fn is_being_written(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "part")
+        && File::open(path)
+            .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+}
+
 /// Deletes a log, unless another process has done so.
 fn delete(path: &Path) -> Result<(), Error> {
     match std::fs::remove_file(path) {
@@ -150,6 +162,9 @@ mod tests {
             "train-999999-000009.mcap.part",
         ];
         files.iter().for_each(|name| write(name));
+        let incomplete = directory.path().join("train-999999-000009.mcap.part");
+        let writer = File::options().write(true).open(&incomplete).unwrap();
+        writer.try_lock().unwrap();
         let mut budget = LogBudget::new(directory.path().to_owned(), 500);
         assert_eq!(budget.enforce().unwrap(), 0, "other files are not counted");
 
@@ -164,8 +179,12 @@ mod tests {
                 "train-999999-000009.mcap.part"
             ]
         );
+        budget.limit_bytes = 240;
+        assert_eq!(budget.enforce().unwrap(), 1, "a log that is being written stays");
+        assert!(incomplete.exists());
+        drop(writer);
         budget.limit_bytes = 120;
-        assert_eq!(budget.enforce().unwrap(), 2);
+        assert_eq!(budget.enforce().unwrap(), 1);
         assert_eq!(names(directory.path()), ["eval-000001-000.mcap", "notes.txt"]);
         budget.limit_bytes = 10;
         assert_eq!(budget.enforce().unwrap(), 1);
