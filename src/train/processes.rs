@@ -196,8 +196,16 @@ impl RunProcesses {
         let mut learner = None;
         let mut teacher = None;
         let mut workers = JoinSet::new();
+        let mut learner_end = None;
         for process in self.processes.drain(..) {
-            let State::Running(child) = process.state else { continue };
+            let child = match process.state {
+                State::Running(child) => child,
+                State::Waiting { end, reason, .. } if process.role == Role::Learner => {
+                    learner_end = Some(format!("the learner {end}{reason}"));
+                    continue;
+                }
+                State::Waiting { .. } => continue,
+            };
             match process.role {
                 Role::Learner => learner = Some(child),
                 Role::Teacher => teacher = Some(child),
@@ -216,7 +224,7 @@ impl RunProcesses {
                     None => Saved::TooLate,
                 }
             }
-            None => Saved::Yes,
+            None => learner_end.map_or(Saved::Yes, Saved::Failed),
         };
         if let Some(teacher) = teacher {
             teacher.end(GRACE).await;
