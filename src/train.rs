@@ -274,7 +274,8 @@ impl<'a> Supervisor<'a> {
         }
         if self.awaits_learner && is_new_stream {
             self.awaits_learner = false;
-            self.display.print(&format!("the learner continues from round {}", progress.round));
+            let round = progress.resumed_from_round;
+            self.display.print(&format!("the learner continues from round {round}"));
         }
         // A restarted learner knows neither the time since its last checkpoint nor the time until its restart.
         let elapsed_s = self.started_at.elapsed().as_secs_f64();

@@ -45,17 +45,16 @@ impl EventLog {
     /// Adds the events between the previous snapshot and `view`; returns true if there are any.
     pub(crate) fn update(&mut self, view: &RunView) -> bool {
         let mut new = Vec::new();
-        match &self.former {
-            None => first(view, &mut new),
-            Some(former) => {
-                // Workers leave at the end of a run.
-                if view.end.is_none() {
-                    workers(&former.workers, &view.workers, &mut new);
-                }
-                evaluations(former, view, &mut new);
-                problems(former, view, &mut new);
-            }
+        let former = self.former.take().unwrap_or_else(|| {
+            new.push((Level::Info, start(view)));
+            before_start(view)
+        });
+        // Workers leave at the end of a run.
+        if view.end.is_none() {
+            workers(&former.workers, &view.workers, &mut new);
         }
+        evaluations(&former, view, &mut new);
+        problems(&former, view, &mut new);
         self.former = Some(view.clone());
         let has_new = !new.is_empty();
         for (level, text) in new {
@@ -75,15 +74,19 @@ impl EventLog {
 
 type New = Vec<(Level, String)>;
 
-fn first(view: &RunView, new: &mut New) {
-    let text = match view.round {
+fn start(view: &RunView) -> String {
+    match view.resumed_from_round {
         0 => "The learner started".to_owned(),
         round => format!("The learner continues from round {round}"),
-    };
-    new.push((Level::Info, text));
-    if !view.warning.is_empty() {
-        new.push((Level::Bad, sentence(&view.warning)));
     }
+}
+
+/// Returns the run as it was before the learner started: a fast one has rounds behind it in its first snapshot.
+fn before_start(view: &RunView) -> RunView {
+    let round = view.resumed_from_round;
+    let is_earlier = |row: &&MetricsRow| round > 0 && row.round <= round;
+    let evaluations = view.evaluations.iter().filter(is_earlier).cloned().collect();
+    RunView { evaluations, ..RunView::default() }
 }
 
 /// Adds the workers that came, went or returned.
@@ -245,6 +248,25 @@ mod tests {
         check(vec![other.clone(), worker(3, "a", WorkerState::Waiting)], "a returned");
         let many = (10..20).map(|id| worker(id, &format!("w{id}"), WorkerState::Waiting));
         check(many.chain([other]).collect(), "10 workers joined");
+    }
+
+    #[test]
+    fn the_first_snapshot_tells_what_happened_since_the_start() {
+        let row = |round| MetricsRow { round, success: 0.5, ..MetricsRow::default() };
+        let workers = vec![worker(1, "a", WorkerState::Playing)];
+        let evaluations = Arc::new([row(0), row(4), row(6)]);
+        let mut view = RunView { round: 6, workers, evaluations, ..RunView::default() };
+        let check = |view: &RunView, expected: &str| {
+            let (mut log, mut view) = (EventLog::default(), view.clone());
+            assert_eq!(events_of(&mut log, &mut view, |_| ()), expected);
+            assert_eq!(events_of(&mut log, &mut view, |_| ()), "");
+        };
+        let evaluation = |round: u64| format!("Evaluation in round {round}: success 50.0 %");
+        let all = [0, 4, 6].map(evaluation).join(" | ");
+        check(&view, &format!("The learner started | a joined | {all}"));
+        view.resumed_from_round = 4;
+        let last = evaluation(6);
+        check(&view, &format!("The learner continues from round 4 | a joined | {last}"));
     }
 
     #[test]

@@ -49,6 +49,7 @@ fn snapshot(shared: &Shared, run: &RunConfig, shown_s: f64) -> RunView {
         phase: progress.phase.map_or("", |phase| phase.name()).to_owned(),
         wall_s: wall_s(&progress, now, shown_s),
         round: counters.round,
+        resumed_from_round: progress.counters_before.round,
         env_steps: counters.env_steps,
         max_env_steps: run.stop.max_env_steps,
         max_minutes: run.stop.max_minutes,

@@ -31,6 +31,8 @@ pub struct RunView {
     pub wall_s: f64,
     /// Rounds learned.
     pub round: u64,
+    /// Rounds learned before this learner started; 0 in a new run.
+    pub resumed_from_round: u64,
     /// Environment steps of training.
     pub env_steps: u64,
     /// Environment steps that end the run; 0 if they do not.

@@ -14,6 +14,7 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         n_arms: u32::try_from(progress.n_arms).unwrap_or(u32::MAX),
         strategy: progress.strategy.clone(),
         round: counters.round,
+        resumed_from_round: progress.counters_before.round,
         env_steps: counters.env_steps,
         episodes: counters.episodes,
         updates: counters.updates,

@@ -246,7 +246,7 @@ class WatchRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class Progress(_message.Message):
-    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "advice_queries", "max_env_steps", "max_minutes")
+    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "advice_queries", "resumed_from_round", "max_env_steps", "max_minutes")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     STRATEGY_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +270,7 @@ class Progress(_message.Message):
     WARNING_FIELD_NUMBER: _ClassVar[int]
     ENVIRONMENT_FIELD_NUMBER: _ClassVar[int]
     ADVICE_QUERIES_FIELD_NUMBER: _ClassVar[int]
+    RESUMED_FROM_ROUND_FIELD_NUMBER: _ClassVar[int]
     MAX_ENV_STEPS_FIELD_NUMBER: _ClassVar[int]
     MAX_MINUTES_FIELD_NUMBER: _ClassVar[int]
     task: str
@@ -295,9 +296,10 @@ class Progress(_message.Message):
     warning: str
     environment: str
     advice_queries: int
+    resumed_from_round: int
     max_env_steps: int
     max_minutes: float
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., advice_queries: _Optional[int] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ...) -> None: ...
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., advice_queries: _Optional[int] = ..., resumed_from_round: _Optional[int] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ...) -> None: ...
 
 class WorkerProgress(_message.Message):
     __slots__ = ("worker_id", "name", "episodes", "doing")
