@@ -192,6 +192,7 @@ async fn connect(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Ch
 fn crowd(service: &Service, behaviors: &[Behavior], check: impl Fn(&Service)) {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(1).enable_all().build().expect("a runtime");
+    let since = Instant::now();
     for behavior in behaviors {
         let clients = behavior.crowd(&runtime, service.address);
         service.wait_until_full();
@@ -202,7 +203,9 @@ fn crowd(service: &Service, behaviors: &[Behavior], check: impl Fn(&Service)) {
         drop(clients);
     }
     let log = service.log();
-    assert_eq!(log.matches("too many connections").count(), 1, "{log}");
+    let n_lines = log.matches("too many connections").count() as u64;
+    // One line a minute at most.
+    assert!((1..=1 + since.elapsed().as_secs() / 60).contains(&n_lines), "{log}");
     assert!(!log.contains("cannot accept"), "{log}");
 }
 

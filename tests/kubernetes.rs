@@ -75,6 +75,21 @@ fn account(cluster: &Cluster, teacher: &str, name: &str) -> (u64, u64) {
     (account.spent, account.left)
 }
 
+/// Starts all pods at once, as `kubectl apply` does, and waits until they are ready. A pod that starts too early retries.
+fn start(cluster: &mut Cluster, names: &[String]) {
+    for name in names {
+        cluster.start(name);
+    }
+    // A fast machine would end the run before every pod was seen to be ready.
+    for worker in ["worker-0", "worker-1"] {
+        cluster.signal(worker, "-STOP");
+    }
+    cluster.wait_until_ready();
+    for worker in ["worker-0", "worker-1"] {
+        cluster.signal(worker, "-CONT");
+    }
+}
+
 #[test]
 fn the_manifests_train_to_the_end_while_pods_are_deleted() {
     if !has_redis() {
@@ -93,11 +108,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
         names,
         ["bridge-0", "learner-0", "redis-0", "teacher-0", "teacher-1", "worker-0", "worker-1"]
     );
-    // All pods start at once, as `kubectl apply` starts them. A pod that starts too early retries.
-    for name in &names {
-        cluster.start(name);
-    }
-    cluster.wait_until_ready();
+    start(&mut cluster, &names);
 
     let rounds = |figures: &BTreeMap<String, f64>| {
         figures.get("tandem_run_rounds").copied().unwrap_or_default()

@@ -11,10 +11,8 @@ use std::time::Duration;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// A small advised run of 12 rounds whose budget runs out on the way.
-const SMALL: [&str; 22] = [
-    "--max-env-steps",
-    "4800",
+/// A small advised run whose budget runs out on the way.
+const SMALL: [&str; 20] = [
     "--set",
     "rounds.rollouts=1",
     "--set",
@@ -30,7 +28,7 @@ const SMALL: [&str; 22] = [
     "--set",
     "checkpoint.every_rounds=3",
     "--set",
-    "advice.budget=750",
+    "advice.budget=300",
     "--set",
     "world.substeps=10",
     "--set",
@@ -44,12 +42,17 @@ fn tandem(args: &[&str], out: &Path) -> Command {
     command
 }
 
+/// Environment steps of a run of 12 rounds.
+const SHORT: &str = "4800";
+/// Environment steps of a run of 48 rounds, for disturbances that take time.
+const LONG: &str = "19200";
+
 fn start(workers: &str, out: &Path) -> Child {
-    start_with(workers, &[], out)
+    start_with(workers, SHORT, &[], out)
 }
 
-fn start_with(workers: &str, more: &[&str], out: &Path) -> Child {
-    let mut args = vec!["train", "--json", "--workers", workers];
+fn start_with(workers: &str, env_steps: &str, more: &[&str], out: &Path) -> Child {
+    let mut args = vec!["train", "--json", "--workers", workers, "--max-env-steps", env_steps];
     args.extend(SMALL);
     args.extend(more);
     tandem(&args, out).spawn().expect("starts")
@@ -60,12 +63,15 @@ fn resume(out: &Path) -> Output {
     tandem(&["train", "--json", "--resume", "--workers", "2"], out).output().expect("runs")
 }
 
-/// The digest and metrics of an undisturbed run.
-static UNDISTURBED: LazyLock<(String, Vec<Value>)> = LazyLock::new(|| {
+/// The digest and metrics of an undisturbed run of 12 rounds.
+static UNDISTURBED: LazyLock<(String, Vec<Value>)> = LazyLock::new(|| undisturbed(SHORT));
+
+/// Returns the digest and metrics of an undisturbed run.
+fn undisturbed(env_steps: &str) -> (String, Vec<Value>) {
     let (_keep, out) = run_directory();
-    let digest = digest(&finish(start("2", &out)));
+    let digest = digest(&finish(start_with("2", env_steps, &[], &out)));
     (digest, metrics(&out))
-});
+}
 
 /// Reads the rows of a run's metrics, without the wall time.
 fn metrics(out: &Path) -> Vec<Value> {
@@ -79,8 +85,12 @@ fn metrics(out: &Path) -> Vec<Value> {
 }
 
 fn check_undisturbed_result(ended: &Output, out: &Path) {
-    assert_eq!(digest(ended), UNDISTURBED.0);
-    assert_eq!(metrics(out), UNDISTURBED.1);
+    check_result(ended, out, &UNDISTURBED);
+}
+
+fn check_result(ended: &Output, out: &Path, undisturbed: &(String, Vec<Value>)) {
+    assert_eq!(digest(ended), undisturbed.0);
+    assert_eq!(metrics(out), undisturbed.1);
     let summary = fs::read_to_string(out.join("summary.json")).expect("a summary");
     let printed = String::from_utf8_lossy(&ended.stdout);
     assert_eq!(printed.lines().last(), Some(summary.trim_end()));
@@ -184,14 +194,14 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     let address = occupied.local_addr().expect("bound");
     let served = ["--metrics-listen", &address.to_string()];
     for option in ["--metrics-listen", "--live"] {
-        let refused = finish(start_with("3", &[option, &address.to_string()], &out));
+        let refused = finish(start_with("3", LONG, &[option, &address.to_string()], &out));
         assert_eq!(refused.status.code(), Some(75));
         assert!(stderr(&refused).contains(&format!("cannot listen on {address}")));
         assert!(!out.exists(), "a refusal leaves nothing");
     }
     drop(occupied);
 
-    let run = start_with("3", &served, &out);
+    let run = start_with("3", LONG, &served, &out);
     wait_for_checkpoint(&out);
     let workers = pids(run.id(), "worker");
     assert_eq!(workers.len(), 3);
@@ -202,7 +212,7 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
     let is_served = || page(address).contains("tandem_rounds_total");
     assert!(eventually(is_served), "the new learner serves no metrics");
     let ended = finish(run);
-    check_undisturbed_result(&ended, &out);
+    check_result(&ended, &out, &undisturbed(LONG));
     let messages = stderr(&ended);
     for line in [
         "the learner was killed by signal 9 and is restarted",
@@ -216,13 +226,13 @@ fn killed_processes_are_restarted_and_the_run_ends_like_an_undisturbed_one() {
         );
     }
     let summary = String::from_utf8_lossy(&ended.stdout);
-    assert!(summary.contains("\"env_steps\":4800,"), "{summary}");
+    assert!(summary.contains("\"env_steps\":19200,"), "{summary}");
 }
 
 #[test]
 fn a_learner_that_dies_before_its_first_checkpoint_starts_over() {
     let (_keep, out) = run_directory();
-    let run = start_with("2", &["--set", "checkpoint.every_rounds=1000"], &out);
+    let run = start_with("2", SHORT, &["--set", "checkpoint.every_rounds=1000"], &out);
     // Workers start once the learner listens.
     let is_under_way = || !pids(run.id(), "worker").is_empty();
     assert!(eventually(is_under_way));

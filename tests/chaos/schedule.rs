@@ -162,6 +162,9 @@ impl Iterator for Schedule {
         if self.batch.is_empty() {
             let mut batch = BATCH;
             self.random.shuffle(&mut batch);
+            if self.over_at.is_zero() {
+                kill_each_first(&mut batch);
+            }
             self.batch.extend(batch);
         }
         let fault = self.batch.pop_front().map(|kind| self.fault(kind))?;
@@ -171,6 +174,14 @@ impl Iterator for Schedule {
         let pause = if kills_worker { QUIET_AFTER_WORKER_KILL } else { Duration::ZERO };
         self.next_at = at + self.every.max(pause);
         Some(Event { at, fault })
+    }
+}
+
+/// Puts a kill of each kind of process first: on a fast machine the run is complete before its first batch is.
+fn kill_each_first(batch: &mut [Kind]) {
+    for (idx, role) in [Role::Teacher, Role::Learner, Role::Worker].into_iter().enumerate() {
+        let at = batch.iter().position(|kind| *kind == Kind::Kill(role)).expect("in each batch");
+        batch.swap(idx, at);
     }
 }
 

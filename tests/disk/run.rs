@@ -245,6 +245,7 @@ pub(crate) fn check(fault: &Fault) {
     };
     let hit = device.calls().into_iter().find(|call| call.starts_with('!'));
     let what = format!("{fault}, {hit:?}: {:?}: {}", ended.status, ended.stderr);
+    assert!(device.is_triggered(), "the fault did not occur: {what}");
     check_end(&ended, fault, &what);
     check_logs(&device);
     let ended = match ended.status.code() {

@@ -136,7 +136,7 @@ impl Cluster {
         assert_eq!(self.wait_for_exit(name), None, "{name} ended by itself");
     }
 
-    fn signal(&self, name: &str, signal: &str) {
+    pub(crate) fn signal(&self, name: &str, signal: &str) {
         let pid = self.pod(name).process.as_ref().expect("the pod was started").id().to_string();
         let sent = Command::new("kill").args([signal, &pid]).status().expect("kill runs");
         assert!(sent.success(), "{name} has ended: {}", self.log(name));

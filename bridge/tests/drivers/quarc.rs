@@ -182,8 +182,8 @@ fn arms_that_fall_silent_are_stopped() {
 #[test]
 fn stopped_arms_move_again_over_the_same_connection_after_a_reset() {
     let mut test = Test::moving();
-    test.rig.executor.stop(test.rig.now_s);
     let n_commands = test.side.commands.lock().unwrap().len();
+    test.rig.executor.stop(test.rig.now_s);
     // The stop command was sent between two ticks.
     eventually("the stop arrives", || test.side.commands.lock().unwrap().len() == n_commands + 1);
     for _ in 0..10 {

@@ -156,7 +156,7 @@ async fn a_check_waits_for_the_next_state_after_an_invalid_one() {
 
     let mut other = rig.stranger().await;
     let checking = tokio::spawn(async move { other.check(request).await });
-    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    tokio::time::sleep(std::time::Duration::from_millis(500)).await;
     rig.tap.fail(Fault::None);
     let verdict = checking.await.unwrap().unwrap().into_inner().verdict.unwrap();
     assert!(matches!(verdict, pb::check_response::Verdict::Accepted(_)), "{verdict:?}");
