@@ -133,8 +133,9 @@ class Run:
         """Kills the learner after evaluations that no checkpoint contains, and starts it again."""
         def evaluations_since_the_checkpoint():
             # Checkpoints are named after their rounds.
+            rows = self.rows()
             saved = [int(re.sub(r"\D", "", path.stem)) for path in (self.out / "checkpoint").glob("*.safetensors")]
-            return saved and self.rows() and self.rows()[-1]["round"] > max(saved)
+            return saved and rows and rows[-1]["round"] > max(saved)
 
         wait_for("an evaluation after a checkpoint", evaluations_since_the_checkpoint)
         self.learner.process.kill()
@@ -177,8 +178,9 @@ class Prometheus:
         answer = json.loads(get(self.address, "/api/v1/query", query=expression))
         return answer["data"]["result"]
 
-    def are_all_scraped(self, n_targets):
-        return len(self.query("count_over_time(up[5m]) >= 3 and up == 1")) == n_targets
+    def are_all_scraped(self, n_targets, since_s):
+        window_s = int(time.monotonic() - since_s)
+        return window_s > 0 and len(self.query(f"count_over_time(up[{window_s}s]) >= 3 and up == 1")) == n_targets
 
     def rules(self):
         groups = json.loads(get(self.address, "/api/v1/rules"))["data"]["groups"]
@@ -324,9 +326,11 @@ def main():
         try:
             run.crash_learner()
             # The learner exposes these metrics once it has values for them.
-            for name in ("tandem_environment_deterministic", "tandem_best_evaluation_success_ratio", "tandem_checkpoint_seconds_count"):
+            for name in ("tandem_environment_deterministic", "tandem_best_evaluation_success_ratio"):
                 wait_for(name, lambda name=name: f"\n{name} " in run.learner.page())
-            wait_for("three scrapes of all services", lambda: prometheus.are_all_scraped(len(run.services)))
+            wait_for("a checkpoint of the restarted learner", lambda: re.search(r"\ntandem_checkpoint_seconds_count [1-9]", run.learner.page()))
+            since_s = time.monotonic()
+            wait_for("three scrapes of all services", lambda: prometheus.are_all_scraped(len(run.services), since_s))
             metrics, samples = exposed(run.services)
             check_names(metrics)
             check_table(metrics, write)

@@ -71,14 +71,23 @@ class Bridge:
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+class Slow(AssertionError):
+    """The page was slower than a machine with free processors allows."""
+
+
 def with_motion(bridge, page, check):
-    """Calls `check` during a motion; again with another motion if a busy machine has stopped it."""
+    """Calls `check` during a motion; again with another motion if a busy machine has stopped it or slowed the page."""
+    n_slow = 0
     for _ in range(10):
         bridge.reset()
         mover = bridge.move()
         try:
             page.wait("document.getElementById('motion-text').textContent.includes('first-motion.json')", "a motion is shown")
             return check(mover)
+        except Slow:
+            n_slow += 1
+            if n_slow == 3:
+                raise
         except AssertionError:
             if bridge.status()["stopped"] is None or bridge.status()["stopped"]["name"] not in BUSY:
                 raise
@@ -101,7 +110,8 @@ def check_motion(page, _mover):
     pictures = len({picture for _, picture in shown})
     longest = max(b[0] - a[0] for a, b in zip(shown, shown[1:])) / 1000
     print(f"{pictures / seconds:.1f} different pictures of the arms per second, longest pause {longest:.2f} s")
-    assert pictures / seconds >= 5 and longest < 1, (pictures, seconds, longest)
+    if pictures / seconds < 5 or longest >= 1:
+        raise Slow(pictures, seconds, longest)
     assert page.value("document.querySelectorAll('#view-above .planned').length") == 2
     check_times(page)
 
@@ -117,6 +127,8 @@ def check_times(page):
 
 def check_stop(page, bridge, mover, press, how):
     """The button stops the motion within a second, and the page shows the cause."""
+    n_stops = "document.getElementById('log').textContent.split('a client stopped the arms').length"
+    before = page.value(n_stops)
     began = time.monotonic()
     press()
     page.wait("document.getElementById('phase').textContent === 'stopped'", "the page shows the stop", 5)
@@ -130,8 +142,9 @@ def check_stop(page, bridge, mover, press, how):
     assert "a client stopped the arms (requested)" in last, last
     result = page.value("document.getElementById('stop-result').textContent")
     assert result.startswith("Stopped at ") and "a client stopped the arms" in result, result
-    assert page.value("document.getElementById('log').textContent.includes('a client stopped the arms')")
-    assert shown_s < 1, shown_s
+    page.wait(f"{n_stops} > {before}", "the stop is among the events", 5)
+    if shown_s >= 1:
+        raise Slow(shown_s)
     print(f"a stop by {how} was confirmed on the page after {shown_s:.2f} s")
 
 

@@ -27,7 +27,8 @@ sys.path.insert(0, str(ROOT / "tests" / "dashboard"))
 from devtools import Browser  # noqa: E402
 
 TASKS = ["push", "pick-and-place"]
-MIN_STEPS_PER_S = 15.7
+# Of 16, with room for a step at each end of the measurement.
+MIN_STEPS_PER_S = 15.5
 MAX_BYTES = 5_000_000
 MAGIC_BYTES = 8
 DATA_END, FOOTER, METADATA = 0x0F, 0x02, 0x0C
@@ -141,7 +142,7 @@ def steps_per_s(page, seconds=5):
 def check_speed(page):
     """The page keeps up with the 16 control steps per second of its initial speed, four times that of the arms."""
     fastest = 0.0
-    for _ in range(3):
+    for _ in range(6):
         fastest = max(fastest, steps_per_s(page))
         if fastest >= MIN_STEPS_PER_S:
             break
