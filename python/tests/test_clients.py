@@ -49,6 +49,14 @@ def test_nothing_that_answers_is_an_error_within_the_timeout():
         next(learner.watch())
 
 
+def unless_busy(error):
+    """Raises an error of a motion that a busy machine does not explain."""
+    is_stopped = isinstance(error, tandem.MotionStopped)
+    # Arms that were stopped before a motion starts refuse it.
+    if not (error.name in BUSY if is_stopped else "not idle but Stopped" in str(error)):
+        raise error
+
+
 def test_a_motion_is_played_to_its_end():
     with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge:
         assert bridge.describe().driver == "sim"
@@ -58,8 +66,8 @@ def test_a_motion_is_played_to_its_end():
                     lease.reset()
                     last = lease.move([HOME], speed=1.0)
                 break
-            except tandem.MotionStopped as stopped:
-                assert stopped.name in BUSY
+            except tandem.ServiceError as error:
+                unless_busy(error)
         else:
             pytest.skip("the machine is too busy to move arms")
         assert last.played_s == pytest.approx(last.duration_s)
@@ -69,10 +77,16 @@ def test_a_motion_is_played_to_its_end():
 
 def test_a_motion_that_the_check_refuses_raises_an_error():
     with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge, bridge.lease() as lease:
-        lease.reset()
         below_table = (tandem.WayPoint((-0.1, 0.0, -0.5)), tandem.WayPoint((0.1, 0.0, -0.5)))
-        with pytest.raises(tandem.ServiceError):
-            lease.move([below_table], speed=1.0)
+        for _ in range(5):
+            with pytest.raises(tandem.ServiceError) as raised:
+                lease.reset()
+                lease.move([below_table], speed=1.0)
+            if "the motion is refused" in str(raised.value):
+                break
+            unless_busy(raised.value)
+        else:
+            pytest.skip("the machine is too busy to move arms")
 
 
 def test_a_stop_ends_a_motion_with_its_reason():
