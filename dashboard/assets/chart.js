@@ -11,11 +11,15 @@ function ticks(low, high, n) {
   const magnitude = 10 ** Math.floor(Math.log10(span / n));
   const step = magnitude * [1, 2, 2.5, 5, 10].find((factor) => span / (factor * magnitude) <= n);
   const found = [];
-  for (let tick = Math.ceil(low / step - 1e-9) * step; tick <= high + step * 1e-6; tick += step) {
-    found.push(Math.abs(tick) < step * 1e-6 ? 0 : tick);
+  // Values that hardly differ may have steps below the resolution of a number.
+  for (let idx = Math.ceil(low / step - 1e-9); idx * step <= high + step * 1e-6 && found.length <= 2 * n; idx += 1) {
+    found.push(idx === 0 ? 0 : idx * step);
   }
   return found;
 }
+
+/** Returns the smallest and the largest value; unlike `Math.min(...)`, of any number of values. */
+const extremes = (values) => values.reduce(([low, high], it) => [Math.min(low, it), Math.max(high, it)], [Infinity, -Infinity]);
 
 function short(value) {
   const size = Math.abs(value);
@@ -43,7 +47,10 @@ export class Chart {
     this.svg.addEventListener("pointermove", (event) => this.point(event));
     this.svg.addEventListener("pointerleave", () => this.moveTo(null));
     this.svg.addEventListener("keydown", (event) => this.key(event));
-    this.svg.addEventListener("blur", () => this.moveTo(null));
+    this.svg.addEventListener("blur", () => {
+      this.readout.removeAttribute("aria-live");
+      this.moveTo(null);
+    });
     new ResizeObserver(() => this.draw()).observe(parent);
     this.drawLegend();
   }
@@ -112,14 +119,14 @@ export class Chart {
     const xs = this.rows.map((row) => row.env_steps);
     const bounds = all.flatMap(({ series, points }) => points.flatMap(([, y, row]) =>
       [y, series.low?.(row), series.high?.(row)].filter(isNumber)));
-    let [low, high] = range ?? [Math.min(...bounds), Math.max(...bounds)];
+    let [low, high] = range ?? extremes(bounds);
     if (!isNumber(low) || !isNumber(high)) [low, high] = [0, 1];
     if (!range) {
       const pad = (high - low) * 0.08 || Math.abs(high) * 0.1 || 1;
       [low, high] = [this.options.fromZero ? 0 : low - pad, high + pad];
     }
     // Room after a single point, and round numbers before the first step.
-    const last = Math.max(0, ...xs);
+    const last = Math.max(0, extremes(xs)[1]);
     const xMax = last > 0 ? last * (new Set(xs).size > 1 ? 1 : 1.25) : FIRST_STEPS;
     const [left, right, top, bottom] = [MARGIN.left, width - MARGIN.right, MARGIN.top, height - MARGIN.bottom];
     this.x = (value) => left + (value / xMax) * (right - left);
@@ -174,7 +181,7 @@ export class Chart {
     if (!this.rows.length) return;
     const x = event.clientX - this.svg.getBoundingClientRect().left;
     const distances = this.rows.map((row) => Math.abs(this.x(row.env_steps) - x));
-    this.moveTo(distances.indexOf(Math.min(...distances)));
+    this.moveTo(distances.indexOf(extremes(distances)[0]));
   }
 
   key(event) {

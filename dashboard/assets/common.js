@@ -162,12 +162,16 @@ export function keyed(parent, items, key, create, update) {
   known.forEach((child) => child.remove());
 }
 
+/** Number of characters that fit a tile in its large font. */
+const MAX_LARGE_CHARS = 9;
+
 /** Shows tiles: [[name, value, detail]]. */
 export function showTiles(parent, tiles) {
   keyed(parent, tiles, ([name]) => name,
     ([name]) => el("div", { class: "tile" }, el("dt", {}, name), el("dd", { class: "value" }), el("dd", { class: "detail" })),
     (tile, [, value, detail]) => {
       setText(tile.children[1], value);
+      tile.children[1].classList.toggle("long", value.length > MAX_LARGE_CHARS);
       setText(tile.children[2], detail);
     });
 }
@@ -185,7 +189,10 @@ export function showLog(parent, events) {
 /** Fetches the documents of a state as they change. */
 export class Documents {
   constructor() {
+    /** The versions that were fetched, and the latest ones; the documents that are being fetched. */
     this.versions = {};
+    this.wanted = {};
+    this.loading = new Set();
   }
 
   /** Forgets the versions: a service that starts again may begin with other ones. */
@@ -193,16 +200,25 @@ export class Documents {
     this.versions = {};
   }
 
-  /** Calls `show` with a document if its version is new. A response that comes after a later one is dropped. */
+  /**
+   * Calls `show` with a document if its version is new. A document has one request at a time, so that on a slow
+   * connection it is shown late rather than never.
+   */
   async update(name, version, show) {
-    if (this.versions[name] === version) return;
-    const former = this.versions[name];
-    this.versions[name] = version;
+    this.wanted[name] = version;
+    if (this.loading.has(name)) return;
+    this.loading.add(name);
     try {
-      const found = await fetchJson(`/data/${name}`);
-      if (this.versions[name] === version) show(found);
-    } catch {
-      if (this.versions[name] === version) this.versions[name] = former;
+      while (this.versions[name] !== this.wanted[name]) {
+        const [versions, fetched] = [this.versions, this.wanted[name]];
+        const found = await fetchJson(`/data/${name}`).catch(() => undefined);
+        // The next state tries again.
+        if (found === undefined) return;
+        versions[name] = fetched;
+        show(found);
+      }
+    } finally {
+      this.loading.delete(name);
     }
   }
 }

@@ -29,7 +29,10 @@ export class Player {
       this.pause();
       this.seek(Number(event.target.value));
     });
-    byId("episode-choice").addEventListener("change", (event) => this.choose(Number(event.target.value)));
+    byId("episode-choice").addEventListener("change", (event) => {
+      this.isHeld ||= isMotionReduced();
+      this.choose(Number(event.target.value));
+    });
   }
 
   /**
@@ -44,6 +47,12 @@ export class Player {
     }
     if (playback && JSON.stringify(playback) === JSON.stringify(this.playback)) return;
     this.show(playback);
+  }
+
+  /** Forgets the episodes: another run has the address of the page. */
+  reset() {
+    this.isHeld = false;
+    this.show(null);
   }
 
   show(playback) {
@@ -70,7 +79,7 @@ export class Player {
     this.views = [this.view("view-above", 1), this.view("view-side", 2)];
     this.seek(0);
     this.playing = false;
-    if (this.isHeld || matchMedia("(prefers-reduced-motion: reduce)").matches) this.pause();
+    if (this.isHeld || isMotionReduced()) this.pause();
     else this.start();
   }
 
@@ -118,7 +127,7 @@ export class Player {
     const reached = parts.filter((part) => part.at_goal).length;
     const touching = this.episode.contacts.includes(whole) ? ", arms touch" : "";
     const text = `Step ${whole} of ${this.last()}: ${reached} of ${parts.length} at the goal${touching}`;
-    slider.setAttribute("aria-valuetext", text);
+    if (slider.getAttribute("aria-valuetext") !== text) slider.setAttribute("aria-valuetext", text);
     const next = this.next ? ` The evaluation of round ${this.next.round} follows.` : "";
     setText(byId("episode-text"), `${text}. Policy of round ${this.playback.round}.${next}`);
   }
@@ -205,6 +214,8 @@ export class Player {
     return group;
   }
 }
+
+const isMotionReduced = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 /** Returns half of the drawn gap between the fingers, metres. */
 const gapOf = (part) => Math.max(MIN_GAP_M, part.opening ?? 0);

@@ -83,6 +83,8 @@ function showHeader(s) {
   setText(byId("terms"), `${s.task}, ${plural(s.n_arms, "arm")}, strategy ${s.strategy}, seed ${s.seed}`);
   const phase = byId("phase");
   const ended = s.end && ending(s.end);
+  // The phases of a fast run change several times a second: only its end is announced.
+  phase.setAttribute("aria-live", s.end ? "polite" : "off");
   setText(phase, ended ? ended.word : s.phase || "starting");
   phase.className = `badge ${ended ? ended.level : ""}`;
   setText(byId("clock"), `${clock(s.wall_s)} elapsed, round ${count(s.round)}`);
@@ -212,13 +214,16 @@ function showServices(s) {
     });
 }
 
+/** Fills the table, unless it is folded: a long run has thousands of rows. */
 function showTable(rows) {
+  const table = byId("success-table");
+  if (!table.closest("details").open) return table.replaceChildren();
   const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
   const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
     percent(row.success_without_contact), percent(trained(row)),
     ...["mean_q", "critic_loss", "actor_loss"].map((name) => real(learned((it) => it[name])(row))),
     count(row.advice_spent)];
-  byId("success-table").replaceChildren(
+  table.replaceChildren(
     el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),
     el("tbody", {}, [...rows].reverse().map((row) => el("tr", {}, cells(row).map((cell) => el("td", {}, cell))))));
 }
@@ -231,7 +236,15 @@ function showEpisodeNote() {
     : "The episodes of the latest evaluation were not kept when the learner was started again.");
 }
 
+const nameOf = (s) => [s.run, s.task, s.strategy, s.seed].join(" ");
+
 function show(s) {
+  if (state && nameOf(state) !== nameOf(s)) {
+    // Another run has the address.
+    documents.forget();
+    player.reset();
+    latest = evaluations = null;
+  }
   state = s;
   showHeader(s);
   showTiles(byId("tiles"), tiles(s));
@@ -254,6 +267,8 @@ function show(s) {
   });
   documents.update("log", s.versions.log, (events) => showLog(byId("log"), events));
 }
+
+byId("success-table").closest("details").addEventListener("toggle", () => showTable(evaluations ?? []));
 
 const showCondition = () => showLink(byId("link"), link, state?.end, sinceAlive());
 

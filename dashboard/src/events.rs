@@ -6,7 +6,7 @@ use serde::Serialize;
 use tandem_core::text::counted;
 use tandem_telemetry::{EndView, MetricsRow, RunView, TeacherState, WorkerState, WorkerView};
 
-/// Number of events that are kept.
+/// Number of events that are kept, of problems and of others each.
 const KEPT: usize = 60;
 /// Largest number of workers that events name at a time.
 const MAX_NAMED: usize = 4;
@@ -60,10 +60,22 @@ impl EventLog {
         for (level, text) in new {
             self.events.push_back(Event { at_s: view.wall_s, level, text });
         }
-        while self.events.len() > KEPT {
-            self.events.pop_front();
-        }
+        self.forget_old();
         has_new
+    }
+
+    /// Keeps the latest events, and as many problems: a fast run has an evaluation every second.
+    fn forget_old(&mut self) {
+        for is_info in [true, false] {
+            let of_kind = |it: &Event| (it.level == Level::Info) == is_info;
+            let n = self.events.iter().filter(|it| of_kind(it)).count();
+            let mut n_left_out = n.saturating_sub(KEPT);
+            self.events.retain(|it| {
+                let is_left_out = n_left_out > 0 && of_kind(it);
+                n_left_out -= usize::from(is_left_out);
+                !is_left_out
+            });
+        }
     }
 
     /// Returns the events, oldest first.
@@ -314,7 +326,12 @@ mod tests {
             view.warning = format!("w{idx}");
             log.update(&view);
         }
-        assert_eq!(log.events().len(), KEPT);
+        assert_eq!(log.events().len(), KEPT + 1, "and the start");
         assert_eq!(log.events().back().expect("events").text, format!("W{}", 2 * KEPT - 1));
+        let row = |round| MetricsRow { round, ..MetricsRow::default() };
+        view.evaluations = (0..2 * KEPT as u64).map(row).collect();
+        log.update(&view);
+        let n_problems = log.events().iter().filter(|it| it.level != Level::Info).count();
+        assert_eq!((n_problems, log.events().len()), (KEPT, 2 * KEPT));
     }
 }

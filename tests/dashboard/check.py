@@ -108,6 +108,11 @@ def check_curve(page):
     page.wait(f"{points} >= 1", "the first evaluation is drawn", 60)
     before = page.value(points)
     page.wait(f"{points} > {before}", "the curve grows", 60)
+    rows = "document.querySelectorAll('#success-table tbody tr').length"
+    assert page.value(rows) == 0, "a folded table has rows"
+    page.value("document.getElementById('success-table').closest('details').open = true")
+    page.wait(f"{rows} > {before}", "the table is filled")
+    page.value("document.getElementById('success-table').closest('details').open = false")
     assert page.value("document.querySelectorAll('#success-chart polygon.band').length") == 1
     print(f"the curve grew from {before} to {page.value(points)} points")
 
@@ -212,6 +217,27 @@ def check_pause(page):
       }}, 20));
     }})""")
     assert kept == [0.5, False, 0.5, 1, 0.5, 1, True, 3], kept
+    # Versions follow one another faster than documents arrive.
+    n_shown = page.value("""import('/assets/common.js').then(async ({ Documents }) => {
+      const documents = new Documents(), fetched = window.fetch;
+      let version = 0, n_shown = 0, n_open = 0, most = 0;
+      window.fetch = async (...request) => {
+        if (!request[0].includes('slow')) return fetched(...request);
+        most = Math.max(most, ++n_open);
+        const answer = await fetched(...request);
+        await new Promise(resolve => setTimeout(resolve, 60));
+        n_open -= 1;
+        return answer;
+      };
+      for (; version < 20; version += 1) {
+        documents.update('log?slow', version, () => { n_shown += 1; });
+        await new Promise(resolve => setTimeout(resolve, 20));
+      }
+      await new Promise(resolve => setTimeout(resolve, 500));
+      window.fetch = fetched;
+      return [n_shown > 1, most, documents.versions['log?slow']];
+    })""")
+    assert n_shown == [True, 1, 19], n_shown
     text = page.value("""import('/assets/common.js').then(({ showLink }) => {
       const element = document.createElement('span');
       showLink(element, 'live', null, 25_000);
