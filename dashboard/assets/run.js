@@ -136,7 +136,7 @@ const DOING = {
 
 function showWorkers(s) {
   const hidden = s.n_workers - s.workers.length;
-  const more = hidden > 0 ? `, of which the first ${s.workers.length} are shown` : "";
+  const more = hidden > 0 ? `, of which ${s.workers.length} are shown` : "";
   setText(byId("worker-summary"), s.end ? `${plural(s.n_workers, "worker")}; ${plural(s.n_replay_episodes, "episode")} in the replay buffer.`
     : s.n_workers === 0 ? "No worker has joined yet."
     : `${s.n_active_workers} of ${plural(s.n_workers, "worker")} active${more}; ${plural(s.n_playing_slots, "slot")} playing, `

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use serde::Serialize;
-use tandem_telemetry::RunView;
+use tandem_telemetry::{RunView, WorkerView};
 use tokio::sync::watch;
 
 use crate::events::EventLog;
@@ -13,6 +13,8 @@ use crate::site::{Frame, Site, encode};
 
 /// Number of workers that a page lists by name; a run can have thousands.
 const MAX_WORKERS: usize = 128;
+/// Number of workers without a call or connection that are listed beside more active ones than fit.
+const MAX_INACTIVE_WORKERS: usize = 32;
 
 impl Site {
     /// Returns the site of a run. It encodes each snapshot of `views` once, in a task of the runtime that calls it,
@@ -105,10 +107,26 @@ impl Feed {
         if n_workers <= MAX_WORKERS {
             return encode(&state);
         }
-        let listed = view.workers[..MAX_WORKERS].to_vec();
-        let view = &RunView { workers: listed, ..view.clone() };
+        let view = &RunView { workers: listed(&view.workers), ..view.clone() };
         encode(&State { view, ..state })
     }
+}
+
+/// Returns the workers that are listed of more than [`MAX_WORKERS`], in the same order: active ones, and the latest of
+/// the others. Workers that a rollout has replaced remain known for minutes.
+fn listed(workers: &[WorkerView]) -> Vec<WorkerView> {
+    let n_active = workers.iter().filter(|it| it.state.is_active()).count();
+    let room = MAX_WORKERS - n_active.min(MAX_WORKERS - MAX_INACTIVE_WORKERS);
+    let n_inactive = workers.len() - n_active;
+    let mut n_earlier = n_inactive.saturating_sub(room);
+    let mut n_active_left = MAX_WORKERS - n_inactive.min(room);
+    let is_listed = |worker: &&WorkerView| {
+        let counter = if worker.state.is_active() { &mut n_active_left } else { &mut n_earlier };
+        let is_counted = *counter > 0;
+        *counter -= usize::from(is_counted);
+        is_counted == worker.state.is_active()
+    };
+    workers.iter().filter(is_listed).cloned().collect()
 }
 
 #[cfg(test)]
@@ -154,6 +172,16 @@ mod tests {
         let view = RunView { workers: (0..10_000).map(worker).collect(), ..RunView::default() };
         let state = json(&Feed::default().frame(&view).state);
         assert_eq!(state["workers"].as_array().map(Vec::len), Some(MAX_WORKERS));
+        // A rollout has replaced the first 200 workers by others.
+        let worker = |id: u64| {
+            let state = if id < 200 { WorkerState::Disconnected } else { WorkerState::Playing };
+            let name = id.to_string();
+            WorkerView { id, name, state, slot: None, n_episodes: 0, last_seen_s: 0.0 }
+        };
+        let ids = |n| listed(&(0..n).map(worker).collect::<Vec<_>>());
+        let ids = |n| ids(n).iter().map(|it| it.id).collect::<Vec<_>>();
+        assert_eq!(ids(400), (168..296).collect::<Vec<_>>());
+        assert_eq!(ids(210), (82..210).collect::<Vec<_>>());
         assert_eq!(state["n_workers"], 10_000);
         assert_eq!(state["n_active_workers"], 5_000);
     }
