@@ -55,6 +55,7 @@ export class Player {
     this.show(null);
   }
 
+  /** Replaces what is shown. */
   show(playback) {
     this.playback = playback;
     this.next = null;

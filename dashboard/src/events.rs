@@ -6,7 +6,7 @@ use serde::Serialize;
 use tandem_core::text::counted;
 use tandem_telemetry::{EndView, MetricsRow, RunView, TeacherState, WorkerState, WorkerView};
 
-/// Number of events that are kept, of problems and of others each.
+/// Number of events of level `Info` that are kept, and number of all others.
 const KEPT: usize = 60;
 /// Largest number of workers that events name at a time.
 const MAX_NAMED: usize = 4;
@@ -64,7 +64,8 @@ impl EventLog {
         has_new
     }
 
-    /// Keeps the latest events, and as many problems: a fast run has an evaluation every second.
+    /// Removes the oldest events. Problems are counted separately: a fast run has an evaluation every second, and these
+    /// would displace them.
     fn forget_old(&mut self) {
         for is_info in [true, false] {
             let of_kind = |it: &Event| (it.level == Level::Info) == is_info;

@@ -13,7 +13,7 @@ use crate::site::{Frame, Site, encode};
 
 /// Number of workers that a page lists by name; a run can have thousands.
 const MAX_WORKERS: usize = 128;
-/// Number of workers without a call or connection that are listed beside more active ones than fit.
+/// Number of inactive workers that are listed even if there are more active ones than fit.
 const MAX_INACTIVE_WORKERS: usize = 32;
 
 impl Site {
@@ -112,21 +112,17 @@ impl Feed {
     }
 }
 
-/// Returns the workers that are listed of more than [`MAX_WORKERS`], in the same order: active ones, and the latest of
-/// the others. Workers that a rollout has replaced remain known for minutes.
+/// Selects at most [`MAX_WORKERS`] workers, by number: active ones first, then the latest of the others. Workers that a
+/// rollout has replaced remain known for minutes.
 fn listed(workers: &[WorkerView]) -> Vec<WorkerView> {
-    let n_active = workers.iter().filter(|it| it.state.is_active()).count();
-    let room = MAX_WORKERS - n_active.min(MAX_WORKERS - MAX_INACTIVE_WORKERS);
-    let n_inactive = workers.len() - n_active;
-    let mut n_earlier = n_inactive.saturating_sub(room);
-    let mut n_active_left = MAX_WORKERS - n_inactive.min(room);
-    let is_listed = |worker: &&WorkerView| {
-        let counter = if worker.state.is_active() { &mut n_active_left } else { &mut n_earlier };
-        let is_counted = *counter > 0;
-        *counter -= usize::from(is_counted);
-        is_counted == worker.state.is_active()
-    };
-    workers.iter().filter(is_listed).cloned().collect()
+    let (active, inactive): (Vec<&WorkerView>, Vec<&WorkerView>) =
+        workers.iter().partition(|it| it.state.is_active());
+    let room = MAX_WORKERS - active.len().min(MAX_WORKERS - MAX_INACTIVE_WORKERS);
+    let latest = &inactive[inactive.len().saturating_sub(room)..];
+    let mut listed: Vec<WorkerView> =
+        latest.iter().chain(&active).take(MAX_WORKERS).map(|it| (*it).clone()).collect();
+    listed.sort_by_key(|it| it.id);
+    listed
 }
 
 #[cfg(test)]
