@@ -1,7 +1,7 @@
 // The operator page of a bridge.
-import { byId, clock, el, fetchJson, follow, isNumber, percent, setText, svg } from "/assets/common.js";
+import { byId, clock, el, fetchJson, follow, isNumber, percent, setText, showTable, svg } from "/assets/common.js";
 
-/** Age of the newest state from which the page says that it is old. */
+/** Age of the newest state from which the page says that it is old, milliseconds. */
 const STALE_MS = 1500;
 /** Time within which the bridge has to confirm a stop. */
 const STOP_TIMEOUT_MS = 4000;
@@ -185,15 +185,13 @@ function showArms(s) {
 
 function showJoints(s) {
   const n = Math.max(0, ...s.arms.map((arm) => arm.angles_rad.length));
-  const head = ["", ...Array.from({ length: n }, (_, joint) => `joint ${joint + 1}`)];
+  const joints = Array.from({ length: n }, (_, joint) => joint);
+  const row = (name, values) => [name, ...joints.map((joint) => degrees(values[joint]))];
   const rows = s.arms.flatMap((arm, idx) => [
-    [`Arm ${idx}, measured`, arm.angles_rad],
-    [`Arm ${idx}, planned`, arm.planned_rad],
+    row(`Arm ${idx}, measured`, arm.angles_rad),
+    row(`Arm ${idx}, planned`, arm.planned_rad),
   ]);
-  const cells = (values) => Array.from({ length: n }, (_, joint) => el("td", {}, degrees(values[joint])));
-  byId("joint-table").replaceChildren(
-    el("thead", {}, el("tr", {}, head.map((name) => el("th", { scope: "col" }, name)))),
-    el("tbody", {}, rows.map(([name, values]) => el("tr", {}, el("th", { scope: "row" }, name), cells(values)))));
+  showTable(byId("joint-table"), ["", ...joints.map((joint) => `joint ${joint + 1}`)], rows);
 }
 
 const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
@@ -230,23 +228,25 @@ function show(s) {
 }
 
 function showLink() {
-  const isOld = link !== "lost" && state && sinceState() > STALE_MS;
-  const age = `no state for ${Math.round(sinceState() / 1000)} s`;
+  const isOld = Boolean(link !== "lost" && state && ageOfState() > STALE_MS);
+  const old = "the values are old";
   const element = byId("link");
   element.classList.toggle("lost", link === "lost" || isOld);
   document.body.classList.toggle("stale", link === "lost" || isOld);
   setText(element, {
-    live: isOld ? age : "live",
-    lost: "no connection: the values are old; trying again",
-    full: `too many viewers, trying again; the stop button works${isOld ? `; ${age}` : ""}`,
+    live: isOld ? old : "live",
+    lost: `no connection: ${old}; trying again`,
+    full: `too many viewers, trying again; the stop button works${isOld ? `; ${old}` : ""}`,
   }[link] ?? link);
+  // Hidden from screen readers, which would say it every second.
+  setText(byId("age"), isOld ? `(${Math.round(ageOfState() / 1000)} s)` : "");
 }
 
-const { sinceState } = follow(show, (condition) => {
+const { ageOfState } = follow(show, (condition) => {
   // A bridge that starts again may begin with other versions.
   if (condition === "live") logVersion = null;
   if (condition === "lost") document.title = "No connection – Tandem bridge";
   link = condition;
   showLink();
-});
+}, (s) => 1000 * s.time_s);
 setInterval(showLink, 500);

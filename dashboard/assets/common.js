@@ -10,6 +10,8 @@ const RETRY_MS = 2000;
 const REOPEN_MS = 30_000;
 /** Silence after which a page says that its values are old, milliseconds. */
 const SILENT_MS = 10_000;
+/** Delay of states from which the connection is opened again: a slow one has old states on their way. Milliseconds. */
+const LATE_MS = 5000;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -74,16 +76,23 @@ export async function fetchJson(path) {
  * at a certain age, and the browser opens another one at once, so "lost" is reported only if that fails.
  * A lost connection is opened again for as long as the page exists. A hidden page closes it after a while: browsers open
  * six connections to an address, and the stop button of another page needs one.
+ * A page whose address another kind or version of page has taken is loaded again.
  *
- * Returns functions of the time since the latest state and since the latest sign of the service, milliseconds.
+ * With `timeOf`, which returns the time of a state on the service's clock, milliseconds, a state that has been on its way
+ * for longer than the fastest one of the same connection is older by the difference, and a connection on which states are
+ * much too late is opened again: the service then sends its newest state.
+ *
+ * Returns functions of the age of the latest state and of the time since the latest sign of the service, milliseconds.
  */
-export function follow(onState, onLink) {
+export function follow(onState, onLink, timeOf = null) {
   let source = null;
   let timer = null;
   let hidden = null;
   let stateAt = performance.now();
   let aliveAt = stateAt;
   let openedAt = stateAt;
+  /** The least difference between the page's clock and the service's at the arrival of a state of this connection. */
+  let leastOffset = Infinity;
   const wait = (action, time_ms) => {
     clearTimeout(timer);
     timer = action && setTimeout(action, time_ms);
@@ -97,6 +106,7 @@ export function follow(onState, onLink) {
     close();
     if (document.hidden) return;
     openedAt = performance.now();
+    leastOffset = Infinity;
     source = new EventSource("/events");
     source.onopen = () => {
       wait(null);
@@ -104,9 +114,16 @@ export function follow(onState, onLink) {
       onLink("live");
     };
     source.onmessage = (message) => {
-      stateAt = aliveAt = performance.now();
-      onState(JSON.parse(message.data));
+      aliveAt = performance.now();
+      const state = JSON.parse(message.data);
+      const late_ms = delay(state);
+      onState(state);
+      stateAt = aliveAt - late_ms;
+      if (late_ms > LATE_MS) open();
     };
+    source.addEventListener("page", (message) => {
+      if (message.data !== document.documentElement.dataset.page) location.reload();
+    });
     source.addEventListener("alive", () => {
       aliveAt = performance.now();
     });
@@ -114,6 +131,12 @@ export function follow(onState, onLink) {
       if (event.target.readyState === EventSource.CLOSED) return refused(event.target);
       if (timer === null) wait(lose, GRACE_MS);
     };
+  };
+  const delay = (state) => {
+    if (timeOf === null) return 0;
+    const offset = aliveAt - timeOf(state);
+    leastOffset = Math.min(leastOffset, offset);
+    return offset - leastOffset;
   };
   const lose = () => {
     close();
@@ -145,7 +168,7 @@ export function follow(onState, onLink) {
       onLink("lost");
     }, HIDDEN_MS);
   });
-  return { sinceState: () => performance.now() - stateAt, sinceAlive: () => performance.now() - aliveAt };
+  return { ageOfState: () => performance.now() - stateAt, sinceAlive: () => performance.now() - aliveAt };
 }
 
 /** Replaces the children of `parent` by one element per item, and keeps elements whose key is the same. */
@@ -160,6 +183,24 @@ export function keyed(parent, items, key, create, update) {
     if (parent.children[idx] !== child) parent.insertBefore(child, parent.children[idx] ?? null);
   });
   known.forEach((child) => child.remove());
+}
+
+/** Shows a table of texts, and keeps its cells, so that they can be selected. The first cell of a row names it. */
+export function showTable(table, names, rows) {
+  const nColumns = names.length;
+  if (table.tHead?.rows[0].cells.length !== nColumns) {
+    table.replaceChildren(
+      el("thead", {}, el("tr", {}, names.map(() => el("th", { scope: "col" })))), el("tbody"));
+  }
+  const body = table.tBodies[0];
+  while (body.rows.length > rows.length) body.lastChild.remove();
+  while (body.rows.length < rows.length) {
+    body.append(el("tr", {}, names.map((_, idx) => (idx === 0 ? el("th", { scope: "row" }) : el("td")))));
+  }
+  [names, ...rows].forEach((texts, row) => {
+    const { cells } = table.rows[row];
+    for (let idx = 0; idx < nColumns; idx += 1) setText(cells[idx], texts[idx]);
+  });
 }
 
 /** Number of characters that fit a tile in its large font. */

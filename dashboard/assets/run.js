@@ -1,6 +1,7 @@
 // The dashboard of a run.
 import {
-  byId, clock, count, Documents, el, follow, isNumber, keyed, mark, MARKS, percent, plural, real, setText, showLink, showLog, showTiles,
+  byId, clock, count, Documents, el, follow, isNumber, keyed, mark, MARKS, percent, plural, real, setText, showLink, showLog, showTable,
+  showTiles,
 } from "/assets/common.js";
 import { Chart } from "/assets/chart.js";
 import { Player } from "/assets/player.js";
@@ -154,13 +155,22 @@ function showWorkers(s) {
     });
 }
 
-/** Returns a bar of two shares, hidden from screen readers: a text beside it says the same. */
-function meter(first, second) {
-  const bar = el("div", { class: "meter", "aria-hidden": "true" }, el("i", { class: "fill-first" }), el("i", { class: "fill-second" }));
-  const total = first + second;
-  bar.children[0].style.width = `${total ? (100 * first) / total : 0}%`;
-  bar.children[1].style.width = `${total ? (100 * second) / total : 0}%`;
-  return bar;
+/**
+ * Shows bars of two shares with texts: [{ title, shares, texts }], where `title` is unique. The bars are hidden from screen
+ * readers: the texts say the same.
+ */
+function showShares(parent, items) {
+  keyed(parent, items, ({ title }) => title,
+    ({ title, texts }) => el("div", {}, el("p", {}, title),
+      el("div", { class: "meter", "aria-hidden": "true" }, el("i", { class: "fill-first" }), el("i", { class: "fill-second" })),
+      el("p", { class: "pairs" }, texts.map(() => el("span")))),
+    (item, { shares, texts }) => {
+      const [, meter, pairs] = item.children;
+      shares.forEach((share, idx) => {
+        meter.children[idx].style.width = `${100 * (isNumber(share) ? share : 0)}%`;
+      });
+      texts.forEach((text, idx) => setText(pairs.children[idx], text));
+    });
 }
 
 function showAdvice(s) {
@@ -169,20 +179,21 @@ function showAdvice(s) {
   byId("advice-spent-heading").closest("section").hidden = !uses;
   byId("advice-heading").closest("section").hidden = !uses;
   if (!uses) return;
-  const pair = (...texts) => el("p", { class: "pairs" }, texts.map((text) => el("span", {}, text)));
-  const budget = el("div", {}, meter(s.advice_spent, 0), pair(
-    `${count(s.advice_spent)} of ${count(total)} units spent (${percent(s.advice_spent / total)})`,
-    `${count(s.advice_left)} left`, `${count(s.advice_per_min)} per minute`),
-  pair(`teacher asked on ${count(s.advice_queries)} of ${count(s.env_steps)} training steps`));
-  budget.querySelector("i").style.width = `${(100 * s.advice_spent) / total}%`;
-  byId("advice-budget").replaceChildren(budget);
   const arms = s.acted.map((arm, idx) => {
     const steps = arm.teacher + arm.student;
-    return el("div", {}, el("p", {}, `Arm ${idx}: who acted in training`), meter(arm.teacher, arm.student),
-      pair(`teacher ${percent(arm.teacher / steps)} (${count(arm.teacher)} steps)`,
-        `student ${percent(arm.student / steps)} (${count(arm.student)} steps)`));
+    const shares = [arm.teacher / steps, arm.student / steps];
+    const texts = [`teacher ${percent(shares[0])} (${count(arm.teacher)} steps)`, `student ${percent(shares[1])} (${count(arm.student)} steps)`];
+    return { title: `Arm ${idx}: who acted in training`, shares, texts };
   });
-  byId("acted").replaceChildren(...arms);
+  const spent = s.advice_spent / total;
+  showShares(byId("shares"), [{
+    title: "Budget",
+    shares: [spent],
+    texts: [
+      `${count(s.advice_spent)} of ${count(total)} units spent (${percent(spent)})`, `${count(s.advice_left)} left`,
+      `${count(s.advice_per_min)} per minute`, `teacher asked on ${count(s.advice_queries)} of ${count(s.env_steps)} training steps`,
+    ],
+  }, ...arms]);
 }
 
 function services(s) {
@@ -215,7 +226,7 @@ function showServices(s) {
 }
 
 /** Fills the table, unless it is folded: a long run has thousands of rows. */
-function showTable(rows) {
+function showEvaluations(rows) {
   const table = byId("success-table");
   if (!table.closest("details").open) return table.replaceChildren();
   const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
@@ -223,9 +234,7 @@ function showTable(rows) {
     percent(row.success_without_contact), percent(trained(row)),
     ...["mean_q", "critic_loss", "actor_loss"].map((name) => real(learned((it) => it[name])(row))),
     count(row.advice_spent)];
-  table.replaceChildren(
-    el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),
-    el("tbody", {}, [...rows].reverse().map((row) => el("tr", {}, cells(row).map((cell) => el("td", {}, cell))))));
+  showTable(table, names, [...rows].reverse().map(cells));
 }
 
 /** Says why there is no episode to play. */
@@ -255,7 +264,7 @@ function show(s) {
     evaluations = rows;
     latest = rows.at(-1);
     charts.forEach((chart) => chart.show(rows));
-    showTable(rows);
+    showEvaluations(rows);
     showTiles(byId("tiles"), tiles(state));
     showEpisodeNote();
   });
@@ -268,7 +277,7 @@ function show(s) {
   documents.update("log", s.versions.log, (events) => showLog(byId("log"), events));
 }
 
-byId("success-table").closest("details").addEventListener("toggle", () => showTable(evaluations ?? []));
+byId("success-table").closest("details").addEventListener("toggle", () => showEvaluations(evaluations ?? []));
 
 const showCondition = () => showLink(byId("link"), link, state?.end, sinceAlive());
 

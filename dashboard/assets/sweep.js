@@ -1,6 +1,6 @@
 // The dashboard of a sweep.
 import {
-  byId, clock, count, Documents, el, follow, isNumber, keyed, percent, plural, setText, showLink, showLog, showTiles,
+  byId, clock, count, Documents, el, follow, isNumber, keyed, percent, plural, setText, showLink, showLog, showTable, showTiles,
 } from "/assets/common.js";
 import { Chart } from "/assets/chart.js";
 
@@ -126,7 +126,7 @@ function showCurves() {
   }));
   chart.setSeries(shown.map(([group], idx) => ({
     name: group,
-    class: `g${idx % N_CLASSES}`,
+    class: `g${idx % N_CLASSES}${idx >= N_CLASSES ? " thin" : ""}`,
     value: (row) => mean(row.values[group] ?? []),
     low: (row) => (row.values[group]?.length > 1 ? Math.min(...row.values[group]) : null),
     high: (row) => (row.values[group]?.length > 1 ? Math.max(...row.values[group]) : null),
@@ -147,9 +147,7 @@ function showGroups(shown) {
     return [group, `${finished.length} of ${indices.length}`, count(mean(latest.map((point) => point.env_steps))), percent(mean(success)), range,
       percent(mean(values("success_without_contact"))), percent(mean(tests))];
   };
-  byId("groups").replaceChildren(
-    el("thead", {}, el("tr", {}, names.map((name) => el("th", { scope: "col" }, name)))),
-    el("tbody", {}, shown.map((group) => el("tr", {}, cells(group).map((cell) => el("td", {}, cell))))));
+  showTable(byId("groups"), names, shown.map(cells));
 }
 
 function show(s) {

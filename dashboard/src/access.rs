@@ -146,7 +146,7 @@ fn refusal(access: &Access, request: &Request<Body>) -> Option<Response> {
         return None;
     }
     if path == "/" {
-        return Some((StatusCode::UNAUTHORIZED, Html(page::login())).into_response());
+        return Some((StatusCode::UNAUTHORIZED, Html(page::login().html)).into_response());
     }
     let text = "a token is required: authorization: Bearer TOKEN\n";
     Some((StatusCode::UNAUTHORIZED, text).into_response())

@@ -1,6 +1,7 @@
-//! The HTML of the pages. Scripts fill in the data.
+//! The HTML of the pages and the files that it refers to. Scripts fill in the data.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use sha2::{Digest as _, Sha256};
 
 pub(crate) use bridge::bridge;
 
@@ -9,8 +10,28 @@ mod bridge;
 /// Icon of the pages: two arms that meet.
 const ICON: &str = "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Crect width='32' height='32' rx='7' fill='%230072B2'/%3E%3Cpath d='M5 24 11 9l5 8 5-8 6 15' fill='none' stroke='white' stroke-width='3' stroke-linejoin='round' stroke-linecap='round'/%3E%3Ccircle cx='16' cy='17' r='2.6' fill='%23E69F00'/%3E%3C/svg%3E";
 
+/// The files that pages refer to: name, content type and content.
+pub(crate) const ASSETS: [(&str, &str, &str); 8] = [
+    ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
+    ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
+    ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
+    ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
+    ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
+    ("bridge.js", "text/javascript; charset=utf-8", include_str!("../assets/bridge.js")),
+    ("sweep.js", "text/javascript; charset=utf-8", include_str!("../assets/sweep.js")),
+    ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
+];
+
+/// A page.
+pub(crate) struct Page {
+    /// The HTML text.
+    pub(crate) html: String,
+    /// Changes with every change of the page and its files. Scripts find it in the HTML text.
+    pub(crate) id: String,
+}
+
 /// Returns the page of a run.
-pub(crate) fn run() -> String {
+pub(crate) fn run() -> Page {
     let body = html! {
         (header("Run", "This page needs JavaScript. `tandem status` shows the same values."))
         main #content {
@@ -32,7 +53,7 @@ pub(crate) fn run() -> String {
                 (card("advice-spent", "Advice spent", &html! { div #advice-chart .chart {} }))
             }
             div .columns {
-                (card("advice", "Advice", &html! { div #advice-budget {} div #acted {} }))
+                (card("advice", "Advice", &html! { div #shares .shares {} }))
                 (card("services", "Teacher and ledger", &html! { ul #services .services {} }))
             }
             (card("workers", "Workers", &html! {
@@ -46,7 +67,7 @@ pub(crate) fn run() -> String {
 }
 
 /// Returns the page of a sweep.
-pub(crate) fn sweep() -> String {
+pub(crate) fn sweep() -> Page {
     let body = html! {
         (header("Sweep", "This page needs JavaScript. `tandem report DIRECTORY` prints the same values."))
         main #content {
@@ -65,7 +86,7 @@ pub(crate) fn sweep() -> String {
 }
 
 /// Returns the page that asks for the token.
-pub(crate) fn login() -> String {
+pub(crate) fn login() -> Page {
     let body = html! {
         main .login {
             h1 { "Tandem" }
@@ -158,10 +179,11 @@ fn table(id: &str, caption: &str) -> Markup {
     }
 }
 
-fn document(title: &str, script: &str, body: &Markup) -> String {
+fn document(title: &str, script: &str, body: &Markup) -> Page {
+    let id = id_of(&[title, script, &body.0]);
     let markup = html! {
         (DOCTYPE)
-        html lang="en" {
+        html lang="en" data-page=(id) {
             head {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
@@ -174,5 +196,16 @@ fn document(title: &str, script: &str, body: &Markup) -> String {
             body { (body) }
         }
     };
-    markup.into_string()
+    Page { html: markup.into_string(), id }
+}
+
+/// Returns the identity of a page of these `parts`.
+fn id_of(parts: &[&str]) -> String {
+    let mut digest = Sha256::new();
+    let files = ASSETS.iter().map(|(.., content)| *content);
+    for text in parts.iter().copied().chain(files) {
+        digest.update(text.len().to_le_bytes());
+        digest.update(text);
+    }
+    digest.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
 }

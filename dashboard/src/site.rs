@@ -19,6 +19,7 @@ use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
 
 use crate::access::{self, Access};
+use crate::page::{ASSETS, Page};
 
 /// Time without a state after which an event `alive` is sent, so that both sides notice when the other one is gone.
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
@@ -34,8 +35,7 @@ pub type StopAction =
 /// A page and the data that it shows.
 #[derive(Clone)]
 pub struct Site {
-    /// The HTML text.
-    pub(crate) page: Arc<str>,
+    pub(crate) page: Arc<Page>,
     /// The latest data.
     pub(crate) frames: watch::Receiver<Arc<Frame>>,
     /// The action of the page's stop button, if it has one.
@@ -50,18 +50,6 @@ pub(crate) struct Frame {
     /// Larger documents, JSON. The state has the versions of each, and pages fetch those that have changed.
     pub(crate) documents: BTreeMap<&'static str, Arc<str>>,
 }
-
-/// The files that pages refer to: name, content type and content.
-const ASSETS: [(&str, &str, &str); 8] = [
-    ("style.css", "text/css; charset=utf-8", include_str!("../assets/style.css")),
-    ("common.js", "text/javascript; charset=utf-8", include_str!("../assets/common.js")),
-    ("chart.js", "text/javascript; charset=utf-8", include_str!("../assets/chart.js")),
-    ("player.js", "text/javascript; charset=utf-8", include_str!("../assets/player.js")),
-    ("run.js", "text/javascript; charset=utf-8", include_str!("../assets/run.js")),
-    ("bridge.js", "text/javascript; charset=utf-8", include_str!("../assets/bridge.js")),
-    ("sweep.js", "text/javascript; charset=utf-8", include_str!("../assets/sweep.js")),
-    ("login.js", "text/javascript; charset=utf-8", include_str!("../assets/login.js")),
-];
 
 /// Becomes true when the connection of a request has to end.
 #[derive(Clone)]
@@ -79,7 +67,7 @@ impl Site {
     /// Returns a site that shows `page`. `encode` turns each snapshot of `views` into a frame once, in a task of the
     /// runtime that calls it, until the sender is dropped.
     pub(crate) fn of_views<V: Clone + Send + Sync + 'static>(
-        page: String,
+        page: Page,
         mut views: watch::Receiver<V>,
         mut encode: impl FnMut(&V) -> Frame + Send + 'static,
     ) -> Self {
@@ -91,7 +79,7 @@ impl Site {
                 frames.send_replace(Arc::new(encode(&view)));
             }
         });
-        Self { page: page.into(), frames: receiver, stop: None }
+        Self { page: Arc::new(page), frames: receiver, stop: None }
     }
 
     /// Returns the routes, behind the rules of `access`, for at most `max_viewers` streams of events.
@@ -111,7 +99,7 @@ impl Site {
 }
 
 async fn page(State(served): State<Served>) -> Html<String> {
-    Html(served.site.page.to_string())
+    Html(served.site.page.html.clone())
 }
 
 async fn state(State(served): State<Served>) -> Response {
@@ -140,11 +128,14 @@ async fn events(
         let text = "too many viewers: close another page of this dashboard\n";
         return (StatusCode::SERVICE_UNAVAILABLE, text).into_response();
     };
-    let mut first = Some(Event::default().retry(RETRY_AFTER));
+    // First its page, for viewers that show another one.
+    let page = Event::default().event("page").data(&served.site.page.id).retry(RETRY_AFTER);
     let states = WatchStream::new(served.site.frames).map(move |frame| {
         let _held = &permit;
-        Some(Ok::<_, Infallible>(first.take().unwrap_or_default().data(&*frame.state)))
+        Event::default().data(&*frame.state)
     });
+    let states =
+        tokio_stream::once(page).chain(states).map(|event| Some(Ok::<_, Infallible>(event)));
     let end = WatchStream::new(expiry).filter(|is_old| *is_old).map(|_| None);
     // The stream ends with the first `None`.
     let states = states.chain(tokio_stream::once(None)).merge(end).map_while(|event| event);

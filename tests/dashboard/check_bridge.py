@@ -2,7 +2,8 @@
 
 Starts a bridge with a simulated pair and uses its page as an operator does: the arms move on the page during a motion,
 the stop button stops the motion within a second and the page shows the cause, the keyboard reaches the button first,
-another page cannot press it, an injected fault is shown, nothing overflows on a phone, scripts have no errors. Prints the
+another page cannot press it, an injected fault is shown, values that arrive late count as old, a page whose address
+another one has taken is loaded again, nothing overflows on a phone, scripts have no errors. Prints the
 times that it measured.
 """
 
@@ -191,6 +192,45 @@ def check_layout(page):
     page.check_names()
 
 
+def check_late_states(page):
+    """A state that was on its way for long is old, and a connection of which all are late is opened again."""
+    ages_s, n_open, times_s = page.value("""import('/assets/common.js').then(({ follow }) => {
+      const [streams, shown, ages_s, n_open, real] = [[], [], [], [], window.EventSource];
+      window.EventSource = class {
+        constructor() { streams.push(this); }
+        addEventListener() {}
+        close() {}
+      };
+      const { ageOfState } = follow((state) => shown.push(state.time_s), () => {}, (state) => 1000 * state.time_s);
+      const began_s = performance.now() / 1000;
+      for (const delay_s of [0.5, 0, 2, 4, 7, 7, 7.5]) {
+        streams.at(-1).onmessage({ data: JSON.stringify({ time_s: began_s - delay_s }) });
+        ages_s.push(ageOfState() / 1000);
+        n_open.push(streams.length);
+      }
+      window.EventSource = real;
+      return [ages_s, n_open, shown.map((time_s) => began_s - time_s)];
+    })""")
+    # The last two came over a new connection, on which 7 s is the least difference of the clocks that is known.
+    expected_s = [0, 0, 2, 4, 7, 0, 0.5]
+    assert all(0 <= age - expected < 0.3 for age, expected in zip(ages_s, expected_s, strict=True)), ages_s
+    assert n_open == [1, 1, 1, 1, 2, 2, 2], n_open
+    assert len(times_s) == 7, "a late state is shown too"
+
+
+def check_other_page(page):
+    """A page loads itself again if its stream is that of another page, and only then."""
+    send = ("import('/assets/common.js').then(({{ follow }}) => {{ window.former = true; const real = window.EventSource; "
+            "window.EventSource = class {{ constructor() {{ this.heard = {{}}; window.stream = this; }} close() {{}} "
+            "addEventListener(name, act) {{ this.heard[name] = act; }} }}; follow(() => {{}}, () => {{}}); "
+            "window.EventSource = real; window.stream.heard.page({{ data: {} }}); }})")
+    page.value(send.format("document.documentElement.dataset.page"))
+    time.sleep(0.5)
+    assert page.value("window.former") is True
+    page.value(send.format("'another'"))
+    page.wait("window.former === undefined && document.getElementById('link')?.textContent === 'live'", "it is loaded again")
+
+
 def check_hidden(page):
     """A hidden page leaves its connection to others, and has a new one when it is visible again."""
     link = "document.getElementById('link').textContent"
@@ -232,6 +272,10 @@ def main():
         with_motion(bridge, page, by_keyboard)
         check_drill(page, bridge)
         check_layout(page)
+        other = browser.open(bridge.url)
+        check_late_states(other)
+        check_other_page(other)
+        page.show()
         check_hidden(page)
         bridge.process.send_signal(signal.SIGTERM)
         page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)

@@ -2,10 +2,10 @@
 
 use maud::{Markup, html};
 
-use super::{card, document, views};
+use super::{Page, card, document, views};
 
 /// Returns the page of a bridge. The stop button is the first element that the keyboard reaches.
-pub(crate) fn bridge() -> String {
+pub(crate) fn bridge() -> Page {
     let body = html! {
         div .stop-bar {
             button #stop .stop type="button" aria-describedby="stop-result" { "Stop both arms" }
@@ -22,6 +22,8 @@ pub(crate) fn bridge() -> String {
                     span #phase .badge { "connecting" }
                     " "
                     span #link .link { "connecting" }
+                    " "
+                    span #age .link.lost aria-hidden="true" {}
                 }
                 p #clock .clock {}
             }

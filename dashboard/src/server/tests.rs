@@ -1,5 +1,6 @@
 //! A served site over real connections.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -127,6 +128,20 @@ async fn viewers_receive_the_state_and_every_change() {
     let mut rest = Vec::new();
     let closed = tokio::time::timeout(DEADLINE, viewer.read_to_end(&mut rest)).await;
     drop(closed.expect("the stream ends with the service"));
+}
+
+#[tokio::test]
+async fn a_stream_names_its_page_first() {
+    let served = Served::start(Access::local()).await;
+    let head = until(&mut served.send("GET /events", "").await, "data: {").await;
+    let (before, _) = head.split_once("data: {").expect("a state");
+    let id = before.split("event: page\ndata: ").nth(1).and_then(|it| it.lines().next());
+    let id = id.expect("a page comes before the first state");
+    let html = served.ask("GET /", "").await;
+    assert!(html.contains(&format!("data-page=\"{id}\"")), "{id}: {html}");
+    let pages = [crate::page::run(), crate::page::sweep(), crate::page::bridge()];
+    let ids: BTreeSet<String> = pages.into_iter().map(|page| page.id).collect();
+    assert!(ids.len() == 3 && ids.contains(id), "{ids:?}");
 }
 
 #[tokio::test]
