@@ -243,16 +243,16 @@ export class Documents {
 
   /**
    * Calls `show` with a document if its version is new. A document has one request at a time, so that on a slow
-   * connection it is shown late rather than never.
+   * connection it is shown late rather than never. `pathOf` returns its path under `/data`, if that is not its name.
    */
-  async update(name, version, show) {
+  async update(name, version, show, pathOf = () => name) {
     this.wanted[name] = version;
     if (this.loading.has(name)) return;
     this.loading.add(name);
     try {
       while (this.versions[name] !== this.wanted[name]) {
         const [versions, fetched] = [this.versions, this.wanted[name]];
-        const found = await fetchJson(`/data/${name}`).catch(() => undefined);
+        const found = await fetchJson(`/data/${pathOf()}`).catch(() => undefined);
         // The next state tries again.
         if (found === undefined) return;
         versions[name] = fetched;

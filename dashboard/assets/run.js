@@ -260,13 +260,18 @@ function show(s) {
   showWorkers(s);
   showAdvice(s);
   showServices(s);
+  // Of a service whose rows the page has, it fetches the further ones.
+  let kept = [];
   documents.update("evaluations", s.versions.evaluations, (rows) => {
-    evaluations = rows;
-    latest = rows.at(-1);
-    charts.forEach((chart) => chart.show(rows));
-    showEvaluations(rows);
+    evaluations = [...kept, ...rows];
+    latest = evaluations.at(-1);
+    charts.forEach((chart) => chart.show(evaluations));
+    showEvaluations(evaluations);
     showTiles(byId("tiles"), tiles(state));
     showEpisodeNote();
+  }, () => {
+    kept = documents.versions.evaluations === undefined ? [] : evaluations;
+    return `evaluations/${kept.length}`;
   });
   if (documents.versions.playback !== s.versions.playback) hasPlayback = null;
   documents.update("playback", s.versions.playback, (playback) => {

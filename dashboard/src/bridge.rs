@@ -8,9 +8,10 @@ use tandem_core::scene::{ArmScene, Point, Scene};
 use tandem_telemetry::{ArmsEvents, ArmsView, LogLevel, StopView};
 use tokio::sync::watch;
 
+use crate::document::encode;
 use crate::events::Level;
 use crate::page;
-use crate::site::{Frame, Site, StopAction, encode};
+use crate::site::{Frame, Site, StopAction};
 
 /// Number of events that are kept.
 const KEPT: usize = 60;
@@ -127,7 +128,7 @@ impl Feed {
             shapes: view.scene.as_ref().map(shapes).unwrap_or_default(),
             versions: Versions { log: self.n_updates },
         };
-        let documents = self.log.clone().map(|log| ("log", log));
+        let documents = self.log.clone().map(|log| ("log", log.into()));
         Frame { state: encode(&state), documents: documents.into_iter().collect() }
     }
 }
@@ -197,7 +198,7 @@ mod tests {
             (&Value::Null, &1_000.into())
         );
         assert_ne!(idle["versions"], first["versions"]);
-        let log: Value = serde_json::from_str(&frame.documents["log"]).expect("JSON");
+        let log: Value = serde_json::from_str(frame.documents["log"].text()).expect("JSON");
         assert_eq!(
             (&log[0]["level"], &log[1]["text"]),
             (&"warning".into(), &"the arms were reset".into())

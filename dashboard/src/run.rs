@@ -6,10 +6,11 @@ use serde::Serialize;
 use tandem_telemetry::{RunView, WorkerView};
 use tokio::sync::watch;
 
+use crate::document::{Document, encode};
 use crate::events::EventLog;
 use crate::page;
 use crate::playback::Playback;
-use crate::site::{Frame, Site, encode};
+use crate::site::{Frame, Site};
 
 /// Number of workers that a page lists by name; a run can have thousands.
 const MAX_WORKERS: usize = 128;
@@ -53,7 +54,7 @@ struct Feed {
     versions: Versions,
     /// The latest snapshot with evaluations that are encoded in `frame`.
     encoded: Option<RunView>,
-    evaluations: Arc<str>,
+    evaluations: Document,
     playback: Arc<str>,
     events: EventLog,
     log: Arc<str>,
@@ -65,7 +66,7 @@ impl Default for Feed {
         Self {
             versions: Versions::default(),
             encoded: None,
-            evaluations: nothing(),
+            evaluations: Document::from(nothing()),
             playback: nothing(),
             events: EventLog::default(),
             log: nothing(),
@@ -79,7 +80,7 @@ impl Feed {
         let former = self.encoded.take();
         if former.as_ref().is_none_or(|it| !Arc::ptr_eq(&it.evaluations, &view.evaluations)) {
             self.versions.evaluations += 1;
-            self.evaluations = encode(&*view.evaluations);
+            self.evaluations = Document::of_rows(&view.evaluations);
         }
         if former.as_ref().is_none_or(|it| !Arc::ptr_eq(&it.evaluated, &view.evaluated)) {
             self.versions.playback += 1;
@@ -93,8 +94,8 @@ impl Feed {
         self.encoded = Some(view.clone());
         let documents = [
             ("evaluations", self.evaluations.clone()),
-            ("playback", self.playback.clone()),
-            ("log", self.log.clone()),
+            ("playback", self.playback.clone().into()),
+            ("log", self.log.clone().into()),
         ];
         Frame { state: self.state(view), documents: documents.into_iter().collect() }
     }
@@ -151,8 +152,8 @@ mod tests {
         let versions = |frame: &Frame| json(&frame.state)["versions"].clone();
         assert_ne!(versions(&second)["evaluations"], versions(&third)["evaluations"]);
         assert_eq!(versions(&second)["playback"], versions(&third)["playback"]);
-        assert_eq!(json(&third.documents["evaluations"])[0]["success"], 0.25);
-        assert_eq!(json(&third.documents["playback"]), Value::Null);
+        assert_eq!(json(third.documents["evaluations"].text())[0]["success"], 0.25);
+        assert_eq!(json(third.documents["playback"].text()), Value::Null);
     }
 
     #[test]

@@ -13,12 +13,12 @@ use axum::routing::{get, post};
 use axum::{Extension, Router};
 use http::StatusCode;
 use http::header::CONTENT_TYPE;
-use serde::Serialize;
 use tokio::sync::{Semaphore, watch};
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
 
 use crate::access::{self, Access};
+use crate::document::{Document, encode};
 use crate::page::{ASSETS, Page};
 
 /// Time without a state after which an event `alive` is sent, so that both sides notice when the other one is gone.
@@ -47,8 +47,8 @@ pub struct Site {
 pub(crate) struct Frame {
     /// The state, JSON on one line. It is sent with every change, so it is short.
     pub(crate) state: Arc<str>,
-    /// Larger documents, JSON. The state has the versions of each, and pages fetch those that have changed.
-    pub(crate) documents: BTreeMap<&'static str, Arc<str>>,
+    /// Larger documents. The state has the versions of each, and pages fetch those that have changed.
+    pub(crate) documents: BTreeMap<&'static str, Document>,
 }
 
 /// Becomes true when the connection of a request has to end.
@@ -90,6 +90,7 @@ impl Site {
             .route("/state", get(state))
             .route("/events", get(events))
             .route("/data/{name}", get(document))
+            .route("/data/{name}/{from}", get(rows))
             .route("/assets/{name}", get(asset))
             .route("/stop", post(stop))
             .route("/login", post(|| async { StatusCode::NO_CONTENT }))
@@ -104,12 +105,18 @@ async fn page(State(served): State<Served>) -> Html<String> {
 
 async fn state(State(served): State<Served>) -> Response {
     let state = served.site.frames.borrow().state.clone();
-    json(&state)
+    json(state.as_ref().to_owned())
 }
 
 async fn document(State(served): State<Served>, Path(name): Path<String>) -> Response {
     let document = served.site.frames.borrow().documents.get(name.as_str()).cloned();
-    document.map_or_else(not_found, |document| json(&document))
+    document.map_or_else(not_found, |document| json(document.text().to_owned()))
+}
+
+/// Sends the rows of a document from number `from` on.
+async fn rows(State(served): State<Served>, Path((name, from)): Path<(String, usize)>) -> Response {
+    let document = served.site.frames.borrow().documents.get(name.as_str()).cloned();
+    document.and_then(|document| document.rows_from(from)).map_or_else(not_found, json)
 }
 
 async fn asset(Path(name): Path<String>) -> Response {
@@ -148,21 +155,16 @@ async fn events(
 async fn stop(State(served): State<Served>) -> Response {
     let Some(action) = &served.site.stop else { return not_found() };
     match action().await {
-        Ok(stopped) => json(&encode(&BTreeMap::from([("stopped", stopped)]))),
+        Ok(stopped) => json(encode(&BTreeMap::from([("stopped", stopped)])).as_ref().to_owned()),
         Err(problem) => {
             let body = encode(&BTreeMap::from([("problem", problem)]));
-            (StatusCode::SERVICE_UNAVAILABLE, json(&body)).into_response()
+            (StatusCode::SERVICE_UNAVAILABLE, json(body.as_ref().to_owned())).into_response()
         }
     }
 }
 
-fn json(text: &str) -> Response {
-    ([(CONTENT_TYPE, "application/json")], text.to_owned()).into_response()
-}
-
-/// Encodes as JSON on one line. Numbers that are not finite become `null`.
-pub(crate) fn encode<T: Serialize + ?Sized>(value: &T) -> Arc<str> {
-    serde_json::to_string(value).map_or_else(|_unencodable| "null".into(), Into::into)
+fn json(text: String) -> Response {
+    ([(CONTENT_TYPE, "application/json")], text).into_response()
 }
 
 fn not_found() -> Response {

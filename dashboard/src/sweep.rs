@@ -7,9 +7,10 @@ use serde::Serialize;
 use tandem_telemetry::MetricsRow;
 use tokio::sync::watch;
 
+use crate::document::encode;
 use crate::events::{Event, Level, Warnings, warnings};
 use crate::page;
-use crate::site::{Frame, Site, encode};
+use crate::site::{Frame, Site};
 
 /// Number of events that are kept.
 const KEPT_EVENTS: usize = 60;
@@ -214,9 +215,9 @@ impl Feed {
         }
         self.latest = Some(view.clone());
         let documents = [
-            ("runs", self.runs.clone()),
-            ("curves", self.curves.clone()),
-            ("log", self.log.clone()),
+            ("runs", self.runs.clone().into()),
+            ("curves", self.curves.clone().into()),
+            ("log", self.log.clone().into()),
         ];
         Frame { state: self.state(view), documents: documents.into_iter().collect() }
     }
@@ -346,7 +347,7 @@ mod tests {
             (&state["live"][0]["run"], &state["live"][0]["env_steps"]),
             (&1.into(), &400.into())
         );
-        assert_eq!(json(&frame.documents["runs"])[0]["state"], "finished");
+        assert_eq!(json(frame.documents["runs"].text())[0]["state"], "finished");
     }
 
     #[test]
@@ -385,12 +386,12 @@ mod tests {
         let second = versions(&frame);
         assert_eq!((&second["runs"], &second["log"]), (&first["runs"], &first["log"]));
         assert_ne!(second["curves"], first["curves"]);
-        assert_eq!(json(&frame.documents["curves"])[0][0]["success"], 0.5);
+        assert_eq!(json(frame.documents["curves"].text())[0][0]["success"], 0.5);
         view.runs[0].state = SweepRunState::Failed;
         "no disk".clone_into(&mut view.runs[0].failure);
         let frame = feed.frame(&view);
         assert_ne!(versions(&frame)["runs"], first["runs"]);
-        let log = json(&frame.documents["log"]);
+        let log = json(frame.documents["log"].text());
         assert_eq!(
             log.as_array().and_then(|log| log.last()).map(|it| &it["text"]),
             Some(&"a failed: no disk".into())

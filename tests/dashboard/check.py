@@ -112,6 +112,12 @@ def check_curve(page):
     assert page.value(rows) == 0, "a folded table has rows"
     page.value("document.getElementById('success-table').closest('details').open = true")
     page.wait(f"{rows} > {before}", "the table is filled")
+    # The page fetches the rows that it lacks.
+    grown = page.value(rows)
+    page.wait(f"{rows} > {grown}", "the table grows", 60)
+    numbers = page.value("[...document.querySelectorAll('#success-table tbody th')].map(it => Number(it.textContent.replaceAll(',', '')))")
+    assert numbers == sorted(set(numbers), reverse=True), numbers
+    page.wait(f"fetch('/data/evaluations').then(it => it.json()).then(all => all.length === {rows})", "every row is shown", 10)
     page.value("document.getElementById('success-table').closest('details').open = false")
     assert page.value("document.querySelectorAll('#success-chart polygon.band').length") == 1
     print(f"the curve grew from {before} to {page.value(points)} points")

@@ -92,7 +92,11 @@ async fn the_page_refers_to_its_own_files_only_and_all_of_them_exist() {
     }
     assert!(seen.iter().any(|path| path == "/assets/chart.js"), "{seen:?}");
     has_status(&served.ask("GET /assets/none.js", "").await, 404);
-    has_status(&served.ask("GET /data/none", "").await, 404);
+    for missing in ["none", "none/0", "log/0"] {
+        has_status(&served.ask(&format!("GET /data/{missing}"), "").await, 404);
+    }
+    has_status(&served.ask("GET /data/evaluations/0", "").await, 200);
+    has_status(&served.ask("GET /data/evaluations/-1", "").await, 400);
 }
 
 /// Returns the files that a text refers to.
