@@ -80,7 +80,13 @@ pub(crate) fn network(
         max_bytes,
     };
     for tensor in &graph.initializer {
-        interpreter.values.insert(&tensor.name, Value::Constant(Constant::new(tensor)));
+        let value = Value::Constant(Constant::new(tensor));
+        if interpreter.values.insert(&tensor.name, value).is_some() {
+            return Err(ModelError::Tensor {
+                tensor: tandem_core::text::shortened(&tensor.name, 80),
+                problem: "another initializer has the same name".to_owned(),
+            });
+        }
     }
     let inputs = interpreter.add_inputs(graph)?;
     let needed = needed_nodes(graph, &output.name)?;
@@ -154,13 +160,23 @@ fn input_width(input: &ValueInfoProto) -> Result<usize, ModelError> {
     })
 }
 
+fn another_input(name: &str) -> ModelError {
+    ModelError::Value {
+        kind: "input",
+        name: tandem_core::text::shortened(name, 80),
+        problem: "another input has the same name".to_owned(),
+    }
+}
+
 impl<'a> Interpreter<'a> {
     /// Adds the inputs. Initializers may be listed as inputs too; they stay constants.
     fn add_inputs(&mut self, graph: &'a GraphProto) -> Result<Vec<Input>, ModelError> {
         let mut inputs = Vec::new();
         for input in &graph.input {
-            if self.values.contains_key(input.name.as_str()) {
-                continue;
+            match self.values.get(input.name.as_str()) {
+                Some(Value::Constant(_)) => continue,
+                Some(_) => return Err(another_input(&input.name)),
+                None => {}
             }
             check_count("inputs", inputs.len() + 1, MAX_INPUTS)?;
             let width = input_width(input)?;

@@ -45,12 +45,7 @@ pub fn import(
         })
         .transpose()?;
     let n_heads = critic_network.as_ref().map_or(1, |critic| critic.n_output());
-    if n_heads != 1 && n_heads != layout.n_arms() {
-        return Err(ModelError::NotRepresentable(format!(
-            "its critic has {n_heads} values, expected 1, or one for each of {}",
-            counted(layout.n_arms(), "arm")
-        )));
-    }
+    check_heads(n_heads, layout)?;
     let both = || [Some(&actor_network), critic_network.as_ref()].into_iter().flatten();
     let n_hidden = both().map(Converted::widest).max().unwrap_or(1);
     let n_hidden_layers = both().map(|network| network.layers.len() - 1).max().unwrap_or(1);
@@ -84,7 +79,22 @@ pub fn import(
 /// # Errors
 /// When it does not, or cannot.
 pub fn check(model: &Model, role: Role, layout: &TaskSpec) -> Result<(), ModelError> {
-    Converted::new(&BoundNetwork::new(model, role, layout)?, role).map(drop)
+    let network = Converted::new(&BoundNetwork::new(model, role, layout)?, role)?;
+    match role {
+        Role::Actor => Ok(()),
+        Role::Critic => check_heads(network.n_output(), layout),
+    }
+}
+
+/// Refuses a critic with neither one value nor one for each arm.
+fn check_heads(n_heads: usize, layout: &TaskSpec) -> Result<(), ModelError> {
+    if [1, layout.n_arms()].contains(&n_heads) {
+        return Ok(());
+    }
+    Err(ModelError::NotRepresentable(format!(
+        "its critic has {n_heads} values, expected 1, or one for each of {}",
+        counted(layout.n_arms(), "arm")
+    )))
 }
 
 /// Refuses networks that padding would make larger than a policy can be.

@@ -37,6 +37,14 @@ pub enum Error {
         /// Largest accepted value.
         most: usize,
     },
+    /// The critic has neither one value nor one for each arm.
+    #[error("n_heads is {got}, expected 1 or the number of arms, {n_arms}")]
+    Heads {
+        /// Number of values.
+        got: usize,
+        /// Number of arms.
+        n_arms: usize,
+    },
     /// The file cannot be read.
     #[error("cannot read policy file {path:?}")]
     Read {

@@ -11,7 +11,9 @@ use crate::error::Error;
 use crate::inference::{Actor, Critic};
 use crate::mlp::MlpShape;
 use crate::normalizer::NormalizerSnapshot;
-use crate::validation::{check_network_size, check_normalizer, check_parameters, check_size};
+use crate::validation::{
+    check_heads, check_network_size, check_normalizer, check_parameters, check_size,
+};
 
 pub use crate::validation::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS};
 
@@ -112,11 +114,12 @@ impl Policy {
     /// Validates sizes, lengths and numbers.
     ///
     /// # Errors
-    /// Returns an error if a size is out of range, a vector has the wrong length, a number is not finite, or a standard
-    /// deviation is not positive.
+    /// Returns an error if a size is out of range, the critic has neither one value nor one for each arm, a vector has the
+    /// wrong length, a number is not finite, or a standard deviation is not positive.
     pub fn check(&self) -> Result<(), Error> {
         check_network_size(self.n_hidden, self.n_hidden_layers)?;
         check_size("n_heads", self.n_heads, MAX_HEADS)?;
+        check_heads(self.n_heads, self.layout.n_arms())?;
         check_parameters("actor", &self.actor, self.actor_shape().n_parameters())?;
         check_parameters("critic", &self.critic, self.critic_shape().n_parameters())?;
         let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());

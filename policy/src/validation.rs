@@ -22,6 +22,11 @@ pub(crate) const fn check_size(name: &'static str, got: usize, most: usize) -> R
     if got == 0 || got > most { Err(Error::Size { name, got, most }) } else { Ok(()) }
 }
 
+/// Checks that a critic has one value, or one for each of `n_arms` arms.
+pub(crate) fn check_heads(n_heads: usize, n_arms: usize) -> Result<(), Error> {
+    if [1, n_arms].contains(&n_heads) { Ok(()) } else { Err(Error::Heads { got: n_heads, n_arms }) }
+}
+
 /// Checks that there are `expected` parameters and that all are finite.
 pub(crate) fn check_parameters(
     name: &'static str,

@@ -197,11 +197,18 @@ impl StartSampler {
             HandStart::Grasping => true,
         };
         arms.iter().all(|start| (start.object - start.goal).length() >= GOAL_DISTANCE_M)
-            && all_pairs(&objects, |offset| offset.length() >= SEPARATION_M)
+            && all_pairs(&objects, |offset| {
+                offset.length() >= SEPARATION_M.max(diagonal(self.object_half_m))
+            })
             && all_pairs(&goals, |offset| offset.length() >= SEPARATION_M)
             && all_pairs(&hands, |offset| horizontal(offset) >= HAND_SEPARATION_M)
             && hands.iter().all(|hand| objects.iter().all(|object| clear_of(*hand, *object)))
     }
+}
+
+/// Returns the horizontal diagonal of a cube, at which two of them do not overlap, whatever their rotations. Same unit.
+fn diagonal(object_half: f32) -> f32 {
+    2.0 * std::f32::consts::SQRT_2 * object_half
 }
 
 fn horizontal(offset: Vector) -> f32 {

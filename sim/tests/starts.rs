@@ -222,6 +222,21 @@ fn no_start_has_a_contact() {
 }
 
 #[test]
+fn large_cubes_do_not_start_in_each_other_in_the_classic_world() {
+    let edge_m = 0.09;
+    let config = WorldConfig { object_half_size_m: 0.5 * edge_m, ..WorldConfig::default() };
+    for layout in layouts_in(World::Classic).filter(|it| it.n_arms == 2) {
+        let mut env = Env::new(layout, &config).expect("a valid world");
+        for seed in 0..N_SEEDS {
+            env.reset(&mut episode_rng(seed, 0, Stream::Reset), WorldSettings::default());
+            let [first, second] = [0, 1].map(|arm| env.scene().objects[arm].centre);
+            let apart_m = distance(&first, &second);
+            assert!(apart_m >= edge_m * std::f32::consts::SQRT_2 - 1e-4, "{layout:?}: {apart_m}");
+        }
+    }
+}
+
+#[test]
 fn grasped_starts_keep_holding_while_the_hand_moves() {
     let grasping = layouts().filter(|layout| layout.task.grasps());
     for layout in grasping {

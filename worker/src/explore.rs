@@ -137,14 +137,21 @@ fn start_probability(share: f32, hold_mean_steps: f32) -> f32 {
     share / (hold_mean_steps * (1.0 - share) + share)
 }
 
-/// Maps a draw in [0, 1) to a length in `1..=2 * mean - 1`, each equally likely.
+/// Maps a draw in [0, 1) to a length of the given mean. With `n` = 2 × mean − 1, the lengths in `1..=n` are equally likely
+/// if `n` is whole; else a share of draws, the fraction of `n`, has one more of them.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "rounds a number that is not negative down"
 )]
 fn hold_steps(draw: f32, mean_steps: f32) -> u32 {
-    ((draw * (2.0 * mean_steps - 1.0)) as u32).saturating_add(1)
+    let n = 2.0 * mean_steps - 1.0;
+    let longer_share = n.fract();
+    let idx = match draw < longer_share {
+        true => draw / longer_share * (n.floor() + 1.0),
+        false => (draw - longer_share) / (1.0 - longer_share) * n.floor(),
+    };
+    (idx as u32).saturating_add(1)
 }
 
 #[cfg(test)]
@@ -194,6 +201,20 @@ mod tests {
             assert!((mean_steps - 4.0).abs() < 0.1, "mean hold {mean_steps}");
             assert_eq!((holds.iter().min(), holds.iter().max()), (Some(&1), Some(&7)));
         }
+    }
+
+    #[test]
+    fn lengths_have_the_mean_that_is_set() {
+        for mean_steps in [1.0, 1.2, 1.25, 1.5, 2.25, 3.3, 4.0, 49.9] {
+            let n_draws = 100_000;
+            let lengths = (0..n_draws).map(|i| hold_steps(i as f32 / n_draws as f32, mean_steps));
+            let mean = lengths.map(f64::from).sum::<f64>() / f64::from(n_draws);
+            let expected = f64::from(mean_steps);
+            assert!((mean - expected).abs() < 1e-3 * expected, "{mean_steps}: {mean}");
+        }
+        let largest = 1.0_f32.next_down();
+        assert_eq!([0.0, largest].map(|draw| hold_steps(draw, 4.0)), [1, 7]);
+        assert_eq!([0.0, 0.399, 0.401, largest].map(|draw| hold_steps(draw, 1.2)), [1, 2, 1, 1]);
     }
 
     #[test]

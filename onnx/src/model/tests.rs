@@ -178,6 +178,14 @@ fn models_of_other_kinds_are_refused() {
         |model| model.graph.as_mut().unwrap().input[1].r#type = None,
         "input \"b\": it is not a tensor",
     );
+    check(
+        |model| model.graph.as_mut().unwrap().input[1] = value("a", 2),
+        "input \"a\": another input has the same name",
+    );
+    check(
+        |model| model.graph.as_mut().unwrap().initializer.push(tensor("w", &[1], &[1.0])),
+        "tensor \"w\": another initializer has the same name",
+    );
 }
 
 #[test]

@@ -189,6 +189,17 @@ fn sizes_that_the_tensors_do_not_have_are_refused() {
 }
 
 #[test]
+fn a_critic_has_one_value_or_one_for_each_arm() {
+    let layout = Layout::new(Task::Push, 2);
+    for n_heads in 1..=3 {
+        let refusal = decode(&encode(&Policy::sample(layout, n_heads))).err();
+        let expected = "n_heads is 3, expected 1 or the number of arms, 2".to_owned();
+        let expected = (n_heads == 3).then_some(expected);
+        assert_eq!(refusal.map(|error| error.to_string()), expected);
+    }
+}
+
+#[test]
 fn tensors_that_are_not_as_expected_are_refused() {
     let whole = encode(&sample());
     let check = |edit: fn(&mut Map<String, Value>), expected: &str| {
