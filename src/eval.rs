@@ -42,16 +42,19 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let result = measure(&subject, args.episodes, args.seed)?;
     let baselines = Baselines::measure(args, &subject)?;
     let terms = terms(&subject);
-    if let (Some(path), Some(first)) = (&args.record, result.episodes.first()) {
-        record(&subject, &terms, args.seed, first, path)?;
-    }
-    if let Some(directory) = &args.record_dir {
-        record_all(&subject, &terms, args.seed, &result.episodes, directory)?;
-    }
-    if let Some(film) = film {
-        film.write(&filmed(args, subject.layout(), &result.episodes)?)?;
-    }
+    let save = || {
+        if let (Some(path), Some(first)) = (&args.record, result.episodes.first()) {
+            record(&subject, &terms, args.seed, first, path)?;
+        }
+        if let Some(directory) = &args.record_dir {
+            record_all(&subject, &terms, args.seed, &result.episodes, directory)?;
+        }
+        film.map_or(Ok(()), |film| film.write(&filmed(args, subject.layout(), &result.episodes)?))
+    };
+    let saved = save();
+    // Also if a file could not be written: the evaluation may have taken hours.
     print(args, &result, &baselines)?;
+    saved?;
     let Some(address) = args.live.live else { return Ok(()) };
     // Viewers see logs: without a directory for them, they are temporary.
     let temporary = std::env::temp_dir().join(format!("tandem-live-{}", std::process::id()));

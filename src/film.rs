@@ -7,6 +7,7 @@ use tandem_core::{Episode, Layout, TaskSpec, WorldSettings};
 use tandem_picture::{Film, FilmEpisode, FilmStep, film_gif, film_strip};
 use tandem_report::FilmStrip;
 use tandem_sim::{Env, SimError, WorldConfig};
+use tandem_system::atomic_file;
 
 use crate::cli::FilmArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -61,7 +62,7 @@ impl<'a> PlannedFilm<'a> {
             Kind::Strip => film_strip(episodes, &self.film),
         };
         let bytes = bytes.or_exit(Exit::Bug, String::new)?;
-        std::fs::write(self.path, bytes)
+        atomic_file::replace_target(self.path, &bytes)
             .or_cannot_write(|| format!("cannot write {}", self.path.display()))
     }
 }

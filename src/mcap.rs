@@ -31,5 +31,10 @@ pub(crate) fn mcap(args: &McapArgs) -> Result<(), Failed> {
         counts.messages,
         file.display(),
         to.display()
-    ))
+    ))?;
+    if let Some(cause) = &counts.ended_by {
+        let file = file.display();
+        output::message(format_args!("tandem: the rest of {file} cannot be read: {cause}"));
+    }
+    Ok(())
 }

@@ -1,6 +1,7 @@
 //! `tandem picture`: draws a step of an episode as a PNG picture.
 
 use tandem_picture::picture_png;
+use tandem_system::atomic_file;
 
 use crate::cli::PictureArgs;
 use crate::evaluation::EvaluatedPolicy;
@@ -24,7 +25,8 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
     let step = film.steps.get(args.step as usize).or_else(|| film.steps.last());
     let step = step.ok_or_else(|| Failed::usage("the episode has no steps"))?;
     let png = picture_png("", step, (args.size.width, args.size.height));
-    std::fs::write(&args.out, png.or_exit(Exit::Usage, || "--size".to_owned())?)
+    let png = png.or_exit(Exit::Usage, || "--size".to_owned())?;
+    atomic_file::replace_target(&args.out, &png)
         .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
     output::print(args.out.display())?;
     Ok(())

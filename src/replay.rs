@@ -1,5 +1,6 @@
 //! `tandem replay`: simulates recorded episodes again and compares them with their logs.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -288,14 +289,11 @@ fn print_result(replayed: &[Replayed], trials: &[Replayed], json: bool) -> Resul
     let (n_episodes, n_equal) =
         (replayed.len(), replayed.iter().filter(|log| log.outcome.is_ok()).count());
     let cut_short = replayed.iter().filter(|log| log.cut_short && !log.is_not_simulated());
-    let cut_short: Vec<&Path> = cut_short.map(|log| log.file.as_path()).collect();
-    let not_simulated: Vec<&Path> = replayed
-        .iter()
-        .filter(|log| log.is_not_simulated())
-        .map(|log| log.file.as_path())
-        .collect();
+    let cut_short: Vec<_> = cut_short.map(shown).collect();
+    let not_simulated: Vec<_> =
+        replayed.iter().filter(|log| log.is_not_simulated()).map(shown).collect();
     let bad = || replayed.iter().filter(|log| log.outcome.is_err() && !log.is_not_simulated());
-    let trials: Vec<&Path> = trials.iter().map(|log| log.file.as_path()).collect();
+    let trials: Vec<_> = trials.iter().map(shown).collect();
     if json {
         let (differing, unreadable): (Vec<&Replayed>, _) = bad().partition(|log| log.differs());
         let [differing, unreadable] =
@@ -324,12 +322,17 @@ fn print_result(replayed: &[Replayed], trials: &[Replayed], json: bool) -> Resul
     Ok(())
 }
 
+/// Returns the name of a log's file, which need not be UTF-8.
+fn shown(log: &Replayed) -> Cow<'_, str> {
+    log.file.to_string_lossy()
+}
+
 fn problem_json(log: &Replayed) -> Value {
     match &log.outcome {
         Err(RecordError::Differs { step, field, component, logged, played }) => json!({
-            "file": log.file.to_string_lossy(), "step": step, "field": field, "component": component, "logged": logged,
+            "file": shown(log), "step": step, "field": field, "component": component, "logged": logged,
             "played": played,
         }),
-        _ => json!({ "file": log.file.to_string_lossy(), "problem": log.problem() }),
+        _ => json!({ "file": shown(log), "problem": log.problem() }),
     }
 }

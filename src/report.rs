@@ -12,6 +12,7 @@ use tandem_report::{
 use tandem_core::Task;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_core::text::counted;
+use tandem_system::atomic_file;
 use tandem_telemetry::ContactMetrics;
 
 use crate::cli::ReportArgs;
@@ -26,6 +27,13 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     for file in [&args.csv, &args.markdown].into_iter().flatten() {
         output::check_directory_of(file)?;
     }
+    let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
+    output::check_is_no_directory(&page)?;
+    output::check_distinct(&[
+        ("--out", Some(page.as_path())),
+        ("--csv", args.csv.as_deref()),
+        ("--markdown", args.markdown.as_deref()),
+    ])?;
     let mut inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
     for run in &mut inputs.runs {
         // Runs of one configuration form a group, whichever version wrote their files.
@@ -39,7 +47,6 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
         Comparison::of(inputs.runs, baselines)
     };
     comparison.films = films(args)?;
-    let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
     let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
     write(args.csv.as_deref(), || export::csv(&comparison))?;
@@ -50,7 +57,8 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
 /// Writes `text` to a file that the command line names.
 fn write(path: Option<&Path>, text: impl FnOnce() -> String) -> Result<(), Failed> {
     path.map_or(Ok(()), |path| {
-        std::fs::write(path, text()).or_cannot_write(|| format!("cannot write {}", path.display()))
+        let written = atomic_file::replace_target(path, text().as_bytes());
+        written.or_cannot_write(|| format!("cannot write {}", path.display()))
     })
 }
 
@@ -169,12 +177,13 @@ fn films(args: &ReportArgs) -> Result<Vec<FilmStrip>, Failed> {
     Ok(films)
 }
 
-/// Returns `report.html` in the directory of the report if there is a single one. The directory of a run has a page of
-/// that name, so that the comparison becomes `comparison.html`.
+/// Returns `report.html` in the directory of the report if there is a single one, else in the working directory. The
+/// directory of a run has a page of that name, so that the comparison becomes `comparison.html`.
 fn default_page(paths: &[PathBuf]) -> PathBuf {
     match paths {
         [dir] if dir.join("metrics.jsonl").exists() => dir.join("comparison.html"),
         [dir] if dir.is_dir() => dir.join("report.html"),
+        _ if Path::new("metrics.jsonl").exists() => PathBuf::from("comparison.html"),
         _ => PathBuf::from("report.html"),
     }
 }

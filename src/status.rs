@@ -50,7 +50,15 @@ async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> R
     let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
     let is_live = !args.json && output::is_terminal();
     let mut display = is_live.then(|| Display::new(false));
-    while let Some(progress) = stream.message().await.map_err(|status| failed(&status))? {
+    loop {
+        let progress = match stream.message().await {
+            Ok(Some(progress)) => progress,
+            Err(status) if !is_lost(&status) => return Err(failed(&status)),
+            Ok(None) | Err(_) => {
+                let lost = anyhow!("the learner is gone before the end of the run");
+                return Err(Failed::new(Exit::TryAgain, lost));
+            }
+        };
         if args.json {
             output::print(progress_json(&progress))?;
         } else if let Some(display) = &mut display {
@@ -72,7 +80,11 @@ async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> R
             return Ok(());
         }
     }
-    Err(Failed::new(Exit::TryAgain, anyhow!("the learner is gone before the end of the run")))
+}
+
+/// Returns whether an open stream ended because its connection did.
+fn is_lost(status: &Status) -> bool {
+    matches!(status.code(), Code::Unknown | Code::Unavailable | Code::Cancelled | Code::Internal)
 }
 
 /// Runs a call with a timeout.

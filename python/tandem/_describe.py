@@ -136,16 +136,27 @@ def _probe(env: gymnasium.Env[Any, Any]) -> list[_Sample]:
     samples = []
     for seed in range(_PROBE_EPISODES):
         observation, info = env.reset(seed=seed)
-        samples.append(_Sample(_copied(observation), info))
+        samples.append(_Sample(_checked(observation, env.observation_space), info))
+        goal = samples[-1].observation["desired_goal"]
         for _ in range(_PROBE_STEPS):
             action = random.uniform(space.low, space.high).astype(space.dtype)
             observation, _, _, _, info = env.step(action)
-            samples.append(_Sample(_copied(observation), info))
+            samples.append(_Sample(_checked(observation, env.observation_space), info))
+            if not np.array_equal(samples[-1].observation["desired_goal"], goal):
+                raise ServiceError("desired_goal changes within an episode: an episode has one goal")
     return samples
 
 
-def _copied(observation: dict[str, Any]) -> dict[str, NDArray[Any]]:
-    return {key: np.array(observation[key]) for key in _KEYS}
+def _checked(observation: dict[str, Any], space: Any) -> dict[str, NDArray[Any]]:
+    """Returns a copy of an observation whose parts have the shapes of their spaces and finite numbers."""
+    copied = {key: np.array(observation[key]) for key in _KEYS}
+    for key, numbers in copied.items():
+        if numbers.shape != space[key].shape:
+            raise ServiceError(f"{key} has shape {list(numbers.shape)}, its space {list(space[key].shape)}")
+        if not np.isfinite(numbers).all():
+            index = int(np.argmin(np.isfinite(numbers)))
+            raise ServiceError(f"{key}[{index}] is {numbers[index]}, expected a finite number")
+    return copied
 
 
 def _find_achieved_goal(samples: list[_Sample]) -> tuple[int, ...] | None:
@@ -182,7 +193,7 @@ def _checked_achieved_goal(samples: list[_Sample], indices: Sequence[int]) -> tu
         if len(indices) != len(achieved) or any(not 0 <= index < len(observation) for index in indices):
             limits = f"{len(achieved)} indices from 0 to {len(observation) - 1}"
             raise ServiceError(f"achieved_goal: expected {limits}, got {list(indices)}")
-        if not np.array_equal(observation[list(indices)], achieved):
+        if not np.array_equal(observation[list(indices)].astype(np.float32), achieved.astype(np.float32)):
             raise ServiceError(f"the observation does not have the achieved goal at {list(indices)}")
     return tuple(indices)
 

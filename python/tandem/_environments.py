@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tandem._describe import TaskOptions, describe
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
-from tandem._gym import EnvFn, GymEnvironment, make
+from tandem._gym import EnvFn, GymEnvironment, InvalidEpisode, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
 from tandem._task import Arm, Floats, Manipulation, Norm, Reflection, Task
 
@@ -74,12 +74,19 @@ class _Environments:
 class EnvironmentFailure(Exception):
     """An exception of an environment, with its text."""
 
+    def __init__(self, text: str, *, is_final: bool = False) -> None:
+        super().__init__(text)
+        self.is_final = is_final
+        """Whether the same episode would fail again."""
+
 
 @contextlib.contextmanager
 def _named(index: int) -> Iterator[None]:
     try:
         yield
-    except Exception as error:
+    except InvalidEpisode as error:
+        raise EnvironmentFailure(f"environment {index}: {error}", is_final=True) from error
+    except (Exception, SystemExit) as error:
         raise EnvironmentFailure(f"environment {index}: {type(error).__name__}: {error}") from error
 
 
@@ -95,7 +102,7 @@ def _serve_pipe(pipe: Any, pickled: bytes) -> None:
             try:
                 pipe.send((True, getattr(environments, method)(argument)))
             except EnvironmentFailure as error:
-                pipe.send((False, str(error)))
+                pipe.send((False, (str(error), error.is_final)))
     environments.close()
 
 
@@ -170,7 +177,8 @@ class _ProcessPool:
         except (EOFError, OSError) as error:
             raise EnvironmentFailure("a process of the environments ended unexpectedly") from error
         if failure is not None:
-            raise EnvironmentFailure(failure)
+            text, is_final = failure
+            raise EnvironmentFailure(text, is_final=is_final)
         return answers
 
 
@@ -279,7 +287,8 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
         except Refused as error:
             context.abort(error.code, str(error))
         except EnvironmentFailure as error:
-            context.abort(grpc.StatusCode.INTERNAL, str(error))
+            code = grpc.StatusCode.DATA_LOSS if error.is_final else grpc.StatusCode.INTERNAL
+            context.abort(code, str(error))
         except grpc.RpcError:
             pass  # The client has gone.
         finally:
@@ -365,7 +374,7 @@ class EnvironmentServer(Server):
                 self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
         except ServiceError:
             raise
-        except Exception as error:  # Environments raise errors of their own.
+        except (Exception, SystemExit) as error:  # Environments raise errors of their own.
             raise ServiceError(f"the environment cannot be used: {type(error).__name__}: {error}") from error
         self.task.check()
         task = self.task

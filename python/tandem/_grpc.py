@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # Failures are raised; the library's own log would repeat them.
 
@@ -130,6 +130,9 @@ class _RequireToken(grpc.ServerInterceptor):  # type: ignore[misc]
         return grpc.unary_unary_rpc_method_handler(refuse)
 
 
+_ServerT = TypeVar("_ServerT", bound="Server")
+
+
 class Server:
     """A running server: a context manager that stops it, with the address in `address`."""
 
@@ -186,7 +189,7 @@ class Server:
         while not self._stopped.wait(0.5):
             pass  # A short wait lets Python handle signals on all systems.
 
-    def __enter__(self) -> Server:
+    def __enter__(self: _ServerT) -> _ServerT:
         return self
 
     def __exit__(

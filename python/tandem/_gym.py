@@ -45,6 +45,10 @@ def _make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
         raise ServiceError(f"cannot create environment {name!r}: {error}") from error
 
 
+class InvalidEpisode(Exception):
+    """An environment breaks a rule of episodes. Playing the same episode again would give the same result."""
+
+
 class GymEnvironment:
     """A Gymnasium environment with the vectors of its task."""
 
@@ -60,6 +64,7 @@ class GymEnvironment:
         self._range = space.high.astype(np.float64) - self._low
         self._is_unscaled = bool((space.low == -1).all() and (space.high == 1).all())
         self._n_steps = 0
+        self._goal = np.zeros(0, np.float32)
 
     def reset(self, seed: int) -> tuple[Floats, Floats]:
         """Starts an episode. Returns the observation, shape `[n_observation]`, and the goal, shape `[n_goal]`."""
@@ -67,7 +72,8 @@ class GymEnvironment:
         self._n_steps = 0
         goal = np.asarray(observation["desired_goal"], np.float32)
         _check_numbers("desired_goal", goal, self._goal_bounds)
-        return self._vector(observation), goal
+        self._goal = goal
+        return self._vector(observation), goal.copy()
 
     def step(self, action: Floats) -> tuple[Floats, int]:
         """Executes an action in [-1, 1], shape `[n_action]`.
@@ -77,6 +83,8 @@ class GymEnvironment:
         """
         observation, _, terminated, _, info = self._env.step(self._own_action(action))
         self._n_steps += 1
+        if not np.array_equal(np.asarray(observation["desired_goal"], np.float32), self._goal):
+            raise InvalidEpisode(f"desired_goal changed at step {self._n_steps}: an episode has one goal")
         if terminated and self._n_steps < self._task.episode_steps:
             self._check_termination(observation)
         return self._vector(observation), contact_bits(info)
@@ -103,18 +111,20 @@ class GymEnvironment:
         """Accepts an end because the goal is achieved, after which the environment is stepped on."""
         task = self._task
         if distance(task.norm, observation["achieved_goal"], observation["desired_goal"]) > task.tolerance:
-            raise RuntimeError(
+            raise InvalidEpisode(
                 f"the environment terminated at step {self._n_steps} without its goal: "
                 f"an episode always has {task.episode_steps} steps"
             )
 
 
 def _check_numbers(name: str, numbers: Floats, bounds: Floats) -> None:
+    if numbers.shape != bounds.shape:
+        raise InvalidEpisode(f"{name} has shape {list(numbers.shape)}, expected {list(bounds.shape)}")
     # Written so that NaN fails the comparison.
     within = np.abs(numbers) <= bounds
     if not within.all():
         index = int(np.argmin(within))
-        raise RuntimeError(f"{name}[{index}] is {numbers[index]:g}, beyond its bound {bounds[index]:g}")
+        raise InvalidEpisode(f"{name}[{index}] is {numbers[index]:g}, beyond its bound {bounds[index]:g}")
 
 
 def contact_bits(info: dict[str, Any]) -> int:

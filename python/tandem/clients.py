@@ -62,6 +62,10 @@ class CallError(ServiceError):
         self.is_temporary = code in _TEMPORARY
         """Whether the same call may succeed later."""
 
+    # Pickling would call the constructor with the message alone.
+    def __reduce__(self) -> tuple[type[CallError], tuple[str, str]]:
+        return type(self), (self.code, str(self))
+
 
 class MotionStopped(ServiceError):
     """A motion that ended because the arms were stopped. `name` is the reason's code; docs/bridge.md lists them."""
@@ -69,6 +73,10 @@ class MotionStopped(ServiceError):
     def __init__(self, name: str, sentence: str) -> None:
         super().__init__(f"the arms are stopped: {sentence}")
         self.name = name
+        self._sentence = sentence
+
+    def __reduce__(self) -> tuple[type[MotionStopped], tuple[str, str]]:
+        return type(self), (self.name, self._sentence)
 
 
 class _Client:
@@ -168,6 +176,8 @@ class Advice:
     charged: bool
     """Whether the step cost a unit of the budget."""
     arms: tuple[ArmAdvice, ...]
+    repeated: bool = False
+    """Whether the step of this episode was decided before: the advice is the former one, whatever the observation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +264,7 @@ def _advice(message: teacher_pb2.StepAdvice) -> Advice:
         )
         for arm in message.arms
     )
-    return Advice(np.array(message.action, np.float32), message.charged, tuple(arms))
+    return Advice(np.array(message.action, np.float32), message.charged, tuple(arms), message.repeated)
 
 
 class Learner(_Client):

@@ -25,6 +25,9 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         hangs_at: int | None = None,
         terminates_at: int | None = None,
         contacts: bool = False,
+        exits_at: int | None = None,
+        moves_goal_at: int | None = None,
+        nan_at: int | None = None,
         tandem_task: dict[str, Any] | None = None,
     ) -> None:
         unbounded = spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -43,6 +46,7 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
         self._fails_at, self._terminates_at = fails_at, terminates_at
         self._hangs_at = hangs_at
         self._contacts = contacts
+        self._exits_at, self._moves_goal_at, self._nan_at = exits_at, moves_goal_at, nan_at
         self.tandem_task = tandem_task
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -58,7 +62,13 @@ class PointEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
             raise RuntimeError("the motor is on fire")
         if len(self.actions) == self._hangs_at:
             threading.Event().wait()
+        if len(self.actions) == self._exits_at:
+            raise SystemExit("the motor is gone")
+        if len(self.actions) == self._moves_goal_at:
+            self._goal = self._goal + 1
         self._position = self._position + action / 10
+        if len(self.actions) == self._nan_at:
+            self._position[0] = np.nan
         terminated = len(self.actions) == self._terminates_at
         reward = self.compute_reward(self._position, self._goal, {})
         info = {"arm_contact": len(self.actions) % 2 == 0, "table_contact": True} if self._contacts else {}

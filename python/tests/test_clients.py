@@ -1,5 +1,6 @@
 """Clients of the built program's services."""
 
+import pickle
 import shutil
 import subprocess
 
@@ -155,3 +156,11 @@ def test_calls_use_tls_and_the_token(tmp_path):
         tandem.Teacher(address, token_file=token) as teacher,
     ):
         assert teacher.describe().policy_digest == server.digest
+
+
+def test_errors_survive_pickling() -> None:
+    """Otherwise a pool of processes would wait for ever for the result of a call that failed."""
+    error = pickle.loads(pickle.dumps(tandem.CallError("UNAVAILABLE", "no answer")))
+    assert (error.code, error.is_temporary, str(error)) == ("UNAVAILABLE", True, "no answer")
+    stopped = pickle.loads(pickle.dumps(tandem.MotionStopped("requested", "a client stopped the arms")))
+    assert (stopped.name, str(stopped)) == ("requested", "the arms are stopped: a client stopped the arms")

@@ -168,13 +168,35 @@ def test_faults_of_environments_are_reported_with_their_text() -> None:
             assert len(client.play(requests[:-1])) == 11
     with tandem.EnvironmentServer((ID, {"terminates_at": 11})) as server:
         code, message = Client(server).refusal(requests)
-        assert code == "INTERNAL" and "terminated at step 11 without its goal" in message
+        assert code == "DATA_LOSS" and "terminated at step 11 without its goal" in message
+    # Playing the episode again would give the same.
+    final = {
+        "nan_at": "environment 0: observation[2] is nan, beyond its bound 1000",
+        "moves_goal_at": "environment 0: desired_goal changed at step 11: an episode has one goal",
+    }
+    for argument, expected in final.items():
+        for workers in (1, 2):
+            with tandem.EnvironmentServer((ID, {argument: 11}), workers=workers) as server:
+                assert Client(server).refusal(requests) == ("DATA_LOSS", expected)
+    with tandem.EnvironmentServer((ID, {"exits_at": 11})) as server:
+        assert Client(server).refusal(requests) == ("INTERNAL", "environment 0: SystemExit: the motor is gone")
+
+
+def test_an_environment_that_breaks_the_rules_is_refused_at_the_start() -> None:
+    cases = {
+        "nan_at": r"observation\[2\] is nan, expected a finite number",
+        "moves_goal_at": "desired_goal changes within an episode",
+        "exits_at": "the environment cannot be used: SystemExit: the motor is gone",
+    }
+    for argument, expected in cases.items():
+        with pytest.raises(tandem.ServiceError, match=expected):
+            tandem.EnvironmentServer((ID, {argument: 5}))
 
 
 def test_a_number_beyond_its_bound_is_an_error() -> None:
     with tandem.EnvironmentServer(ID, bound=1.0) as server:
         code, message = Client(server).refusal([reset([(0, 1)])])
-        assert code == "INTERNAL" and "observation[3] is 7, beyond its bound 1" in message
+        assert code == "DATA_LOSS" and "observation[3] is 7, beyond its bound 1" in message
 
 
 def test_streams_beyond_the_limit_are_refused() -> None:

@@ -4,7 +4,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 
 use serde::de::DeserializeOwned;
-use tandem_system::regular_file;
+use tandem_system::{atomic_file, regular_file};
 
 use crate::error::Error;
 
@@ -68,9 +68,9 @@ pub(crate) fn read_text(path: &Path) -> std::io::Result<String> {
     String::from_utf8(regular_file::read(path)?).map_err(not_utf8)
 }
 
-/// Writes `content` to `path`.
+/// Writes `content` to `path`. A former file stays as it is if that fails.
 pub(crate) fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
-    std::fs::write(path, content).map_err(write_error(path))
+    atomic_file::replace_target(path, content).map_err(write_error(path))
 }
 
 /// Creates a directory unless it exists.

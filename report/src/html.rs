@@ -126,13 +126,20 @@ fn figure_grid<'a>(svgs: impl Iterator<Item = (&'a str, &'a str)>) -> String {
 /// Escapes text for HTML and SVG.
 pub(crate) fn escaped(text: &str) -> String {
     // XML knows no control characters but these.
-    let text = text.replace(|c: char| c.is_control() && !"\t\n\r".contains(c), "\u{fffd}");
+    let is_foreign =
+        |c: char| (c.is_control() && !"\t\n\r".contains(c)) || matches!(c, '\u{fffe}' | '\u{ffff}');
+    let text = text.replace(is_foreign, "\u{fffd}");
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn characters_that_xml_does_not_have_are_replaced() {
+        assert_eq!(escaped("<a\u{1b}\u{ffff}\u{fffe}\tü"), "&lt;a\u{fffd}\u{fffd}\u{fffd}\tü");
+    }
 
     #[test]
     fn a_film_strip_has_each_of_its_pictures_once_for_narrow_screens() {

@@ -17,6 +17,7 @@ use tandem_system::atomic_file;
 
 use crate::cli::{ExportArgs, ImportArgs};
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::output::check_distinct;
 use crate::{output, policy_file, served_task};
 
 /// Number of random states on which an imported policy is compared with its models.
@@ -126,33 +127,6 @@ fn layout(args: &ImportArgs, actor: &Model) -> Result<TaskSpec, Failed> {
         let failed = refused(&args.actor, source);
         if names_task(actor) { failed } else { failed.context(UNKNOWN_TASK.to_owned()) }
     })
-}
-
-/// Rejects two arguments that name one file: writing one would destroy the other.
-pub(super) fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Failed> {
-    let mut former: Vec<(&str, PathBuf)> = Vec::new();
-    for (name, path) in files {
-        let Some(path) = path else { continue };
-        let file = resolved(path);
-        if let Some((other, _)) = former.iter().find(|(_, other)| *other == file) {
-            let shown = path.display();
-            return Err(Failed::usage(format!(
-                "{name} {shown}: {other} is the same file; choose another"
-            )));
-        }
-        former.push((name, file));
-    }
-    Ok(())
-}
-
-/// Returns the path without links and `..`, as far as it exists.
-fn resolved(path: &Path) -> PathBuf {
-    let in_directory = || {
-        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
-        let parent = parent.unwrap_or(Path::new(".")).canonicalize().ok()?;
-        Some(parent.join(path.file_name()?))
-    };
-    path.canonicalize().ok().or_else(in_directory).unwrap_or_else(|| path.to_owned())
 }
 
 fn refused(path: &Path, source: ModelError) -> Failed {

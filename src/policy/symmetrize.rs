@@ -4,9 +4,8 @@ use serde_json::json;
 
 use crate::cli::SymmetrizeArgs;
 use crate::exit::{Failed, OrExit as _};
+use crate::output::check_distinct;
 use crate::{output, policy_file};
-
-use super::onnx::check_distinct;
 
 pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;

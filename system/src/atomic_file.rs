@@ -20,6 +20,19 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace_with(path, |mut file| file.write_all(bytes))
 }
 
+/// Replaces the file that `path` names with `bytes`, or writes them to it if it is no regular file, as `/dev/stdout`. If
+/// `path` is a link, the file that it leads to is replaced.
+///
+/// # Errors
+/// As [`replace_with`].
+pub fn replace_target(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    match fs::metadata(path) {
+        Ok(metadata) if !metadata.is_file() => fs::write(path, bytes),
+        Ok(_) => replace(&fs::canonicalize(path)?, bytes),
+        Err(_) => replace(path, bytes),
+    }
+}
+
 /// Replaces the file `path` with what `write` writes, and returns the value of `write`.
 ///
 /// # Errors
@@ -99,6 +112,20 @@ mod tests {
             assert_eq!(fs::read_to_string(&path).expect("readable"), contents);
         }
         assert_eq!(names(directory.path()), ["run.toml"]);
+    }
+
+    #[test]
+    fn the_target_of_a_link_is_replaced_and_a_device_is_written() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let [file, link] = ["page.html", "latest.html"].map(|name| directory.path().join(name));
+        replace_target(&file, b"old").expect("writes");
+        std::os::unix::fs::symlink(&file, &link).expect("a link");
+        replace_target(&link, b"new").expect("writes");
+        assert_eq!(fs::read(&file).expect("readable"), b"new");
+        assert!(link.is_symlink());
+        replace_target(Path::new("/dev/null"), b"nothing").expect("writes");
+        assert!(replace_target(directory.path(), b"").is_err());
+        assert_eq!(names(directory.path()), ["latest.html", "page.html"]);
     }
 
     #[test]
