@@ -444,20 +444,31 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
 
 
 def run(start: Callable[[], Server], *, ends_with_stdin: bool = False) -> None:
-    """Starts a server, prints its address, and stops it when the process is asked to end."""
+    """Starts a server, prints its address, and stops it when the process is asked to end, also while it starts."""
     asked = threading.Event()
+    is_starting = True
+
+    def ask(_number: int, _frame: Any) -> None:
+        asked.set()
+        if is_starting:
+            raise KeyboardInterrupt
+
     is_main = threading.current_thread() is threading.main_thread()
     handlers = {}
     if is_main:
         for number in (signal.SIGINT, signal.SIGTERM):
-            handlers[number] = signal.signal(number, lambda _number, _frame: asked.set())
+            handlers[number] = signal.signal(number, ask)
     try:
         if ends_with_stdin:
             threading.Thread(target=_wait_for_end_of_stdin, args=(asked,), daemon=True).start()
         with start() as server:
+            is_starting = False
             print(f"listening on {server.address}", flush=True)
             while not asked.wait(0.5):
                 pass  # A short wait lets Python handle signals on all systems.
+    except KeyboardInterrupt:
+        if not asked.is_set():
+            raise
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -150,11 +150,17 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
 def task_name(task: str, world: str) -> str:
     """Returns the name that `task` in `world` has in files, such as `"shared-push"`.
 
+    Such a name is accepted as `task` too, if its world is `world`.
+
     Raises:
-        ValueError: The world does not exist.
+        ValueError: The world or the task does not exist.
     """
     if world not in RENDER_FPS:
         raise ValueError(f"unknown world {world!r}: expected {' or '.join(RENDER_FPS)}")
+    if world == "shared":
+        task = task.removeprefix("shared-")
+    if task not in ("push", "pick-and-place", "carry-bar"):
+        raise ValueError(f"unknown task {task!r} in world {world!r}: expected push, pick-and-place or carry-bar")
     if (task == "carry-bar") != (world == "slow"):
         raise ValueError(f"no task {task!r} in world {world!r}: carry-bar is the only task of the slow world")
     return f"{world}-{task}" if world == "shared" else task

@@ -497,3 +497,16 @@ def test_the_command_takes_arms_and_refuses_bad_ones() -> None:
     ]:
         code, errors = Command(ID, option, text).end()
         assert code == 64 and f"argument {option}: {expected}" in errors and errors.count("\n") == 1, errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_server_that_is_still_starting_ends_when_it_is_asked_to(number: signal.Signals) -> None:
+    script = "import time, tandem; tandem.serve(lambda: (print('creating', flush=True), time.sleep(300)))"
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "creating\n"
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=60)
+        assert (process.returncode, output, errors) == (0, "", "")
+    finally:
+        process.kill()

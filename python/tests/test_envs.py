@@ -147,7 +147,8 @@ def test_actions_of_other_types_have_the_same_effect(rng):
 
 def test_wrong_arguments_name_what_is_wrong():
     for arguments, message in [
-        ({"task": "lift"}, "unknown task"),
+        ({"task": "lift"}, "unknown task 'lift' in world 'shared': expected push, pick-and-place or carry-bar"),
+        ({"task": "shared-push", "world": "classic"}, "unknown task 'shared-push' in world 'classic'"),
         ({"n_arms": 3}, "3 arms"),
         ({"substeps": 7}, "substeps"),
         ({"grasped_start_prob": 2.0}, "grasped_start_prob"),
