@@ -55,7 +55,8 @@ async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> R
             Ok(Some(progress)) => progress,
             Err(status) if !is_lost(&status) => return Err(failed(&status)),
             Ok(None) | Err(_) => {
-                let lost = anyhow!("the learner is gone before the end of the run");
+                let address = &args.address;
+                let lost = anyhow!("the learner at {address} is gone before the end of the run");
                 return Err(Failed::new(Exit::TryAgain, lost));
             }
         };

@@ -10,7 +10,7 @@ const RETRY_MS = 2000;
 const REOPEN_MS = 30_000;
 /** Silence after which a page says that its values are old, milliseconds. */
 const SILENT_MS = 10_000;
-/** Delay of states from which the connection is opened again: a slow one has old states on their way. Milliseconds. */
+/** Delay of states beyond which the connection is opened again, milliseconds. */
 const LATE_MS = 5000;
 
 export const byId = (id) => document.getElementById(id);
@@ -76,11 +76,11 @@ export async function fetchJson(path) {
  * at a certain age, and the browser opens another one at once, so "lost" is reported only if that fails.
  * A lost connection is opened again for as long as the page exists. A hidden page closes it after a while: browsers open
  * six connections to an address, and the stop button of another page needs one.
- * A page whose address another kind or version of page has taken is loaded again.
+ * A page reloads itself if another kind or version of page is now served at its address.
  *
- * With `timeOf`, which returns the time of a state on the service's clock, milliseconds, a state that has been on its way
- * for longer than the fastest one of the same connection is older by the difference, and a connection on which states are
- * much too late is opened again: the service then sends its newest state.
+ * `timeOf` returns the time of a state on the service's clock, milliseconds. With it, the age of a state includes its delay:
+ * the time that it took to arrive beyond that of the fastest state of the same connection. If states arrive late by more
+ * than `LATE_MS`, the connection is opened again, which begins with the service's newest state.
  *
  * Returns functions of the age of the latest state and of the time since the latest sign of the service, milliseconds.
  */

@@ -70,10 +70,11 @@ class GymEnvironment:
         """Starts an episode. Returns the observation, shape `[n_observation]`, and the goal, shape `[n_goal]`."""
         observation, _ = self._env.reset(seed=seed)
         self._n_steps = 0
-        goal = np.asarray(observation["desired_goal"], np.float32)
+        # A copy: the environment may change its own array in place.
+        goal = np.array(observation["desired_goal"], np.float32)
         _check_numbers("desired_goal", goal, self._goal_bounds)
         self._goal = goal
-        return self._vector(observation), goal.copy()
+        return self._vector(observation), goal
 
     def step(self, action: Floats) -> tuple[Floats, int]:
         """Executes an action in [-1, 1], shape `[n_action]`.

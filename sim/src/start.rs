@@ -198,7 +198,7 @@ impl StartSampler {
         };
         arms.iter().all(|start| (start.object - start.goal).length() >= GOAL_DISTANCE_M)
             && all_pairs(&objects, |offset| {
-                offset.length() >= SEPARATION_M.max(diagonal(self.object_half_m))
+                offset.length() >= SEPARATION_M.max(diagonal_m(self.object_half_m))
             })
             && all_pairs(&goals, |offset| offset.length() >= SEPARATION_M)
             && all_pairs(&hands, |offset| horizontal(offset) >= HAND_SEPARATION_M)
@@ -206,9 +206,10 @@ impl StartSampler {
     }
 }
 
-/// Returns the horizontal diagonal of a cube, at which two of them do not overlap, whatever their rotations. Same unit.
-fn diagonal(object_half: f32) -> f32 {
-    2.0 * std::f32::consts::SQRT_2 * object_half
+/// Returns the diagonal of the base of a cube with half edge `object_half_m`, metres. Two cubes whose centres are at least
+/// this far apart do not overlap.
+fn diagonal_m(object_half_m: f32) -> f32 {
+    2.0 * std::f32::consts::SQRT_2 * object_half_m
 }
 
 fn horizontal(offset: Vector) -> f32 {

@@ -222,7 +222,7 @@ fn no_start_has_a_contact() {
 }
 
 #[test]
-fn large_cubes_do_not_start_in_each_other_in_the_classic_world() {
+fn large_cubes_do_not_overlap_at_the_start_in_the_classic_world() {
     let edge_m = 0.09;
     let config = WorldConfig { object_half_size_m: 0.5 * edge_m, ..WorldConfig::default() };
     for layout in layouts_in(World::Classic).filter(|it| it.n_arms == 2) {

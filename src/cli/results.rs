@@ -37,7 +37,7 @@ pub(crate) struct EvalArgs {
     pub(crate) baselines: bool,
     /// Evaluates on the same starts and goals under conditions that differ from the usual ones, one at a time: other
     /// sizes and masses of the cubes, other friction, noise in the positions of the objects, late actions, and bases that
-    /// are not where they are believed to be. Starts without room for larger cubes are drawn anew.
+    /// are not where they are believed to be. Starts that have no room for larger cubes are drawn again.
     #[arg(long, requires = "policy", conflicts_with_all = [
         "baselines", "record", "record_dir", "film", "live", "env", "env_command"])]
     pub(crate) robustness: bool,
