@@ -7,6 +7,7 @@ mod episode;
 mod policy;
 mod simulation;
 mod task;
+mod threads;
 mod vector;
 
 use pyo3::prelude::*;

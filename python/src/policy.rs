@@ -7,6 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use numpy::{PyArray1, PyArray2, PyArrayDyn, PyArrayMethods as _, PyReadonlyArray2};
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::PyBytes;
 use tandem_policy::{Actor, Critic, Error};
 
 use crate::episode::value_error;
@@ -29,12 +30,19 @@ impl Policy {
     /// Loads and validates a policy file.
     #[new]
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
-        py.detach(|| {
-            let policy = tandem_policy::Policy::load(&path).map_err(load_error)?;
-            let (actor, critic) =
-                (policy.actor().map_err(value_error)?, policy.critic().map_err(value_error)?);
-            Ok(Self { policy, networks: Mutex::new(Networks { actor, critic }) })
-        })
+        py.detach(|| Self::of(tandem_policy::Policy::load(&path).map_err(load_error)?))
+    }
+
+    /// Reads a policy from the bytes of a file, and validates it.
+    #[staticmethod]
+    fn from_bytes(py: Python<'_>, bytes: &[u8]) -> PyResult<Self> {
+        py.detach(|| Self::of(tandem_policy::Policy::from_bytes(bytes).map_err(value_error)?))
+    }
+
+    /// Returns the bytes of a file with the policy.
+    fn to_bytes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
+        let bytes = py.detach(|| self.policy.to_bytes()).map_err(value_error)?;
+        Ok(PyBytes::new(py, &bytes))
     }
 
     /// Name of the task.
@@ -143,6 +151,12 @@ impl Policy {
 }
 
 impl Policy {
+    fn of(policy: tandem_policy::Policy) -> PyResult<Self> {
+        let (actor, critic) =
+            (policy.actor().map_err(value_error)?, policy.critic().map_err(value_error)?);
+        Ok(Self { policy, networks: Mutex::new(Networks { actor, critic }) })
+    }
+
     /// Returns the networks; another thread's panic leaves nothing in them that the next call does not overwrite.
     fn networks(&self) -> MutexGuard<'_, Networks> {
         self.networks.lock().unwrap_or_else(PoisonError::into_inner)

@@ -216,12 +216,20 @@ fn action_of(action: &Bound<'_, PyAny>, n_action: usize) -> PyResult<Vec<f32>> {
     if let Ok(array) = action.cast::<PyArray1<f32>>() {
         return Ok(array.readonly().as_array().iter().copied().collect());
     }
-    // Arrays of other types, such as tensors of PyTorch, are sequences; those of rows are not sequences of numbers.
     let py = action.py();
     let n_dimensions = action.getattr(intern!(py, "ndim")).and_then(|number| number.extract());
-    if n_dimensions.is_ok_and(|number: usize| number != 1) {
-        let shape = action.getattr(intern!(py, "shape"))?;
-        return Err(value_error(format!("the action has shape {shape}, expected ({n_action},)")));
+    match n_dimensions {
+        // Arrays of other types, such as tensors of PyTorch, need not be sequences.
+        Ok(1) => {
+            let array = py.import("numpy")?.call_method1("asarray", (action, "float32"))?;
+            return Ok(array.cast::<PyArray1<f32>>()?.readonly().as_array().to_vec());
+        }
+        Ok(_) => {
+            let shape = action.getattr(intern!(py, "shape"))?;
+            let problem = format!("the action has shape {shape}, expected ({n_action},)");
+            return Err(value_error(problem));
+        }
+        Err(_) => {}
     }
     action.extract().map_err(|error| shape_error(action, n_action).unwrap_or(error))
 }

@@ -3,13 +3,13 @@
 use numpy::{Element, PyArray1, PyArray2, PyArray3, PyArrayMethods as _, PyReadonlyArray2};
 use pyo3::prelude::*;
 use rayon::prelude::*;
-use rayon::{ThreadPool, ThreadPoolBuilder};
 use tandem_core::{Contacts, WorldSettings};
 use tandem_picture::render;
 use tandem_sim::SimError;
 
 use crate::episode::{Episode, step_error, value_error};
 use crate::simulation::{Course, NewArguments, settings_arguments};
+use crate::threads::Threads;
 
 /// When an environment whose episode is over starts the next one; the modes of Gymnasium.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -61,7 +61,7 @@ type SlotState = (Course, bool, bool);
 #[pyclass(module = "tandem._native")]
 pub(crate) struct VectorSimulation {
     slots: Vec<Slot>,
-    threads: ThreadPool,
+    threads: Threads,
     max_episode_steps: u32,
     autoreset: Autoreset,
 }
@@ -97,9 +97,7 @@ impl VectorSimulation {
             is_over: false,
             last: None,
         };
-        // A pool of its own, so that environments created in a forked process have threads.
-        let threads = ThreadPoolBuilder::new().num_threads(num_threads.min(num_envs)).build();
-        let threads = threads.map_err(value_error)?;
+        let threads = Threads::start(num_threads.min(num_envs))?;
         Ok(Self { slots: vec![slot; num_envs], threads, max_episode_steps, autoreset })
     }
 
@@ -116,7 +114,7 @@ impl VectorSimulation {
         if let Some(seeds) = &seeds {
             self.check_length("seeds", seeds.len())?;
         }
-        let (slots, threads) = (&mut self.slots, &self.threads);
+        let (slots, threads) = (&mut self.slots, &mut self.threads);
         let start = |(idx, slot): (usize, &mut Slot)| {
             slot.last = None;
             let seed = seeds.as_ref().and_then(|seeds| seeds[idx]);
@@ -128,7 +126,7 @@ impl VectorSimulation {
                 slot.seed = seed;
             }
         };
-        py.detach(|| threads.install(|| slots.par_iter_mut().enumerate().for_each(start)));
+        py.detach(|| threads.install(|| slots.par_iter_mut().enumerate().for_each(start)))?;
         Ok((self.observations(py)?, self.infos(py)))
     }
 
@@ -139,7 +137,7 @@ impl VectorSimulation {
         actions: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Steps<'py>> {
         let actions = self.checked_actions(&actions)?;
-        let (slots, threads) = (&mut self.slots, &self.threads);
+        let (slots, threads) = (&mut self.slots, &mut self.threads);
         let (limit, autoreset) = (self.max_episode_steps, self.autoreset);
         let n_action = actions.len() / slots.len();
         let step = |(slot, action): (&mut Slot, &[f32])| slot.step(action, limit, autoreset);
@@ -147,7 +145,7 @@ impl VectorSimulation {
             threads.install(|| {
                 slots.par_iter_mut().zip(actions.par_chunks(n_action)).map(step).collect()
             })
-        });
+        })?;
         let rewards = results.into_iter().map(|result| result.map(f64::from));
         let rewards: Vec<f64> =
             rewards.collect::<Result<_, _>>().map_err(|error| step_error(&error))?;
@@ -184,7 +182,7 @@ impl VectorSimulation {
         let keywords = settings_arguments(py, episode.settings())?;
         keywords.set_item("max_episode_steps", self.max_episode_steps)?;
         keywords.set_item("autoreset", self.autoreset.name())?;
-        keywords.set_item("num_threads", self.threads.current_num_threads())?;
+        keywords.set_item("num_threads", self.threads.count())?;
         Ok((positional.into_pyobject(py)?, keywords))
     }
 
@@ -194,22 +192,23 @@ impl VectorSimulation {
 
     fn __setstate__(&mut self, py: Python<'_>, state: Vec<SlotState>) -> PyResult<()> {
         self.check_length("state", state.len())?;
-        let (slots, threads) = (&mut self.slots, &self.threads);
+        let (slots, threads) = (&mut self.slots, &mut self.threads);
         let restore = |(slot, state): (&mut Slot, SlotState)| slot.restore(state);
-        py.detach(|| threads.install(|| slots.par_iter_mut().zip(state).try_for_each(restore)))
+        py.detach(|| threads.install(|| slots.par_iter_mut().zip(state).try_for_each(restore)))?
             .map_err(|error| step_error(&error))
     }
 
     /// Draws the scene of every environment, shape `[height, width, 3]` each.
     fn render<'py>(
-        &self,
+        &mut self,
         py: Python<'py>,
         width: usize,
         height: usize,
     ) -> PyResult<Vec<Bound<'py, PyArray3<u8>>>> {
         let draw = |slot: &Slot| render(&slot.episode.env.scene(), width, height).rgb;
+        let (slots, threads) = (&self.slots, &mut self.threads);
         let pictures: Vec<Vec<u8>> =
-            py.detach(|| self.threads.install(|| self.slots.par_iter().map(draw).collect()));
+            py.detach(|| threads.install(|| slots.par_iter().map(draw).collect()))?;
         let pictures = pictures.into_iter();
         pictures.map(|pixels| PyArray1::from_vec(py, pixels).reshape([height, width, 3])).collect()
     }

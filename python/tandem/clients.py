@@ -119,7 +119,19 @@ class _Client:
             code, details = error.code().name, error.details()
             if code == "DEADLINE_EXCEEDED":
                 details = f"no answer within {self._timeout_s:g} s{self._connection_failure()}"
+            # Servers of Tandem and of Python give no other reason for a call that they do not know.
+            if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
+                details = self._wrong_service(error)
             raise CallError(code, f"{self._address}: {details}") from error
+
+    def _wrong_service(self, error: grpc.RpcError) -> str:
+        """Returns which service answered a call that it does not know, as far as it says so."""
+        expected = type(self).__name__.lower()
+        metadata = dict((*(error.initial_metadata() or ()), *(error.trailing_metadata() or ())))
+        served = str(metadata.get("tandem-service", "")).rpartition(".")[2].lower()
+        if served in ("", expected):
+            return "the service does not know the call: it is of another kind or version"
+        return f"the service is {served}, not {expected}: check the address"
 
     def _connection_failure(self) -> str:
         """Returns why there is no connection, after a colon; nothing if there is one."""

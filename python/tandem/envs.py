@@ -85,7 +85,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     ) -> None:
         check_rendering(render_mode, width, height)
         self._simulation = _native.Simulation(
-            task_name(task, world), n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob
+            task_name(task, world),
+            checked_number("n_arms", n_arms),
+            substeps=substeps,
+            grasped_start_prob=grasped_start_prob,
         )
         self.metadata = {**type(self).metadata, "render_fps": RENDER_FPS[world]}
         self.render_mode = render_mode
@@ -210,7 +213,7 @@ def episode_option(options: dict[str, Any] | None) -> int | None:
 
 
 def checked_number(name: str, number: SupportsIndex) -> int:
-    """Returns a seed or the number of an episode.
+    """Returns a seed, the number of an episode or of arms.
 
     Raises:
         ValueError: It is not an integer in [0, 2**64).

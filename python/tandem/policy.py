@@ -23,6 +23,7 @@ class Policy:
 
     Inputs are dictionaries as the environments return them, with arrays of shape `[n]` or `[batch, n]`. Outputs have
     the bits of the Rust implementation, and a row has the same bits in any batch. Any thread may call any method.
+    Policies can be pickled and copied.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -124,6 +125,12 @@ class Policy:
     def _inputs(self, observation: Mapping[str, ArrayLike]) -> tuple[_Floats, _Floats, bool]:
         is_batch = np.ndim(observation["observation"]) > 1
         return _rows(observation["observation"]), _rows(observation["desired_goal"]), is_batch
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_native": self._native.to_bytes()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _native=_native.Policy.from_bytes(state["_native"]))
 
     def __repr__(self) -> str:
         return f"Policy(task={self.task!r}, n_arms={self.n_arms}, digest={self.digest[:12]!r})"

@@ -81,7 +81,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
                 raise ValueError(f"{name} is {count}, expected 1 to 2**32 - 1")
         check_rendering(render_mode, width, height)
         mode = AutoresetMode(autoreset_mode)
-        task = task_name(task, world)
+        task, n_arms = task_name(task, world), checked_number("n_arms", n_arms)
         self.metadata = {**type(self).metadata, "autoreset_mode": mode, "render_fps": RENDER_FPS[world]}
         self.num_envs = num_envs
         self.render_mode = render_mode

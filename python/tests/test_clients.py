@@ -158,6 +158,20 @@ def test_calls_use_tls_and_the_token(tmp_path):
         assert teacher.describe().policy_digest == server.digest
 
 
+def test_the_address_of_another_service_is_named() -> None:
+    with service("teacher", "--ledger", "memory", "--policy", POLICY) as address, tandem.Learner(address) as learner:
+        with pytest.raises(tandem.CallError, match="the service is teacher, not learner: check the address") as raised:
+            learner.watch().__next__()
+        assert not raised.value.is_temporary
+
+    def act(observation, goal):
+        return np.zeros((len(observation), 3))
+
+    with tandem.PolicyServer(act, task="push") as server, tandem.Teacher(server.address) as teacher:
+        with pytest.raises(tandem.CallError, match="does not know the call"):
+            teacher.describe()
+
+
 def test_errors_survive_pickling() -> None:
     """Otherwise a pool of processes would wait for ever for the result of a call that failed."""
     error = pickle.loads(pickle.dumps(tandem.CallError("UNAVAILABLE", "no answer")))

@@ -133,13 +133,23 @@ def test_bad_actions_are_refused_and_change_nothing():
     assert np.array_equal(before["desired_goal"], after["desired_goal"])
 
 
+class _Tensor:
+    """An array that is no sequence, as PyTorch's are not."""
+
+    def __init__(self, array):
+        self._array, self.ndim, self.shape = array, array.ndim, array.shape
+
+    def __array__(self, dtype=None, copy=None):
+        return self._array.astype(dtype)
+
+
 def test_actions_of_other_types_have_the_same_effect(rng):
     env = tandem.TandemEnv("pick-and-place", 2)
     action = rng.uniform(-1, 1, 8).astype(np.float32)
     strided = np.zeros((8, 2), np.float32)
     strided[:, 0] = action
     results = []
-    for given in (action, action.astype(np.float64), action.tolist(), strided[:, 0]):
+    for given in (action, action.astype(np.float64), action.tolist(), strided[:, 0], _Tensor(action)):
         env.reset(seed=1)
         results.append(env.step(given)[0]["observation"])
     assert all(np.array_equal(results[0], result) for result in results[1:])
@@ -150,6 +160,7 @@ def test_wrong_arguments_name_what_is_wrong():
         ({"task": "lift"}, "unknown task 'lift' in world 'shared': expected push, pick-and-place or carry-bar"),
         ({"task": "shared-push", "world": "classic"}, "unknown task 'shared-push' in world 'classic'"),
         ({"n_arms": 3}, "3 arms"),
+        ({"n_arms": -1}, "n_arms is -1"),
         ({"substeps": 7}, "substeps"),
         ({"grasped_start_prob": 2.0}, "grasped_start_prob"),
         ({"render_mode": "human"}, "render mode"),

@@ -1,7 +1,9 @@
 """Policies: the numbers of the file format, success in the simulator, and refused files."""
 
+import copy
 import json
 import os
+import pickle
 import subprocess
 
 import gymnasium
@@ -61,6 +63,17 @@ def test_actions_and_values_have_the_bits_of_rust(path):
     assert probe["digest"] == policy.digest
     assert np.array_equal(actions, np.array(probe["actions"], np.float32))
     assert np.array_equal(policy.q(observation, actions), np.array(probe["q"], np.float32))
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+def test_a_copied_policy_is_the_same_policy(duplicate, rng):
+    policy = tandem.load_policy(POLICIES[0])
+    other = duplicate(policy)
+    observation = inputs(policy, rng, 2)
+    action = policy.predict(observation)[0]
+    assert (type(other), other.digest, other.metadata) == (tandem.Policy, policy.digest, policy.metadata)
+    assert np.array_equal(other.predict(observation)[0], action)
+    assert np.array_equal(other.q(observation, action), policy.q(observation, action))
 
 
 def test_a_row_has_the_same_bits_in_any_batch(rng):

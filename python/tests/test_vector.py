@@ -1,6 +1,7 @@
 """Vector environments: their episodes are those of single environments, in every mode and with any threads."""
 
 import copy
+import multiprocessing
 import pickle
 
 import gymnasium
@@ -166,6 +167,25 @@ def test_copied_environments_continue_their_episodes_with_the_same_bits(mode, du
             actions = rng.uniform(-1, 1, (3, 3))
             for one, two in zip(envs.step(actions), other.step(actions), strict=True):
                 assert_equal(one, two)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="the system does not fork")
+def test_environments_of_a_forked_process_continue_with_threads_of_its_own(rng):
+    envs = tandem.TandemVectorEnv(3, "push", 1, num_threads=2, substeps=10)
+    envs.reset(seed=2)
+    actions = rng.uniform(-1, 1, (3, 3))
+    context = multiprocessing.get_context("fork")
+    received, sent = context.Pipe(duplex=False)
+    child = context.Process(target=lambda: sent.send(envs.step(actions)), daemon=True)
+    child.start()
+    try:
+        assert received.poll(60), "the child hangs"
+        for one, two in zip(received.recv(), envs.step(actions), strict=True):
+            assert_equal(one, two)
+        child.join(60)
+        assert child.exitcode == 0
+    finally:
+        child.kill()
 
 
 def test_processes_of_gymnasiums_vector_play_single_environments(rng):
