@@ -55,6 +55,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     // Also if a file could not be written: the evaluation may have taken hours.
     print(args, &result, &baselines)?;
     saved?;
+    print_files(args)?;
     let Some(address) = args.live.live else { return Ok(()) };
     // Viewers see logs: without a directory for them, they are temporary.
     let temporary = std::env::temp_dir().join(format!("tandem-live-{}", std::process::id()));
@@ -146,7 +147,14 @@ fn print(args: &EvalArgs, result: &EvaluationResult, baselines: &Baselines) -> R
     output::print(format_args!("task          {task}, {arms}, seed {}", args.seed))?;
     result.lines().iter().try_for_each(output::print)?;
     baselines.table(result).map_or(Ok(()), output::print)?;
-    output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))?;
+    output::print(format_args!("speed         {:.0} env steps/s", result.steps_per_s))
+}
+
+/// Prints the files that were written.
+fn print_files(args: &EvalArgs) -> Result<(), Failed> {
+    if args.json {
+        return Ok(());
+    }
     let recorded = args.record.iter().chain(&args.record_dir);
     recorded
         .map(|path| path.display())

@@ -26,6 +26,11 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
+/// Returns a cell without control characters, which would break lines or command the terminal.
+fn in_terminal(cell: &str) -> String {
+    cell.replace(char::is_control, "\u{fffd}")
+}
+
 /// Escapes a cell for Markdown: its text is that of a user's directory.
 fn in_markdown(cell: &str) -> String {
     cell.replace('|', "\\|").replace('<', "&lt;").replace(['\n', '\r'], " ")
@@ -44,6 +49,15 @@ impl Table {
     /// its row. If the other columns alone are wider, each row becomes a block with one cell per line.
     #[must_use]
     pub fn text(&self) -> String {
+        let rows = self
+            .rows
+            .iter()
+            .map(|row| row.iter().map(|cell| in_terminal(cell)).collect())
+            .collect();
+        Self { rows, ..self.clone() }.aligned_text()
+    }
+
+    fn aligned_text(&self) -> String {
         let lines: Vec<&Vec<String>> = std::iter::once(&self.header).chain(&self.rows).collect();
         let width = |column: usize| {
             lines.iter().filter_map(|line| line.get(column)).map(|cell| n_chars(cell)).max()
@@ -235,6 +249,13 @@ mod tests {
         assert_eq!(text(&[2.0, 2.01], 2), "2.0");
         assert_eq!(text(&[2.0], 3), "2.0, 1 of 3");
         assert_eq!(text(&[], 3), NONE);
+    }
+
+    #[test]
+    fn names_do_not_break_lines_or_command_the_terminal() {
+        let mut table = Table::new("T".to_owned(), &["run", "success"]);
+        table.rows.push(vec!["a\nb\u{1b}[2J".to_owned(), "1".to_owned()]);
+        assert_eq!(table.text(), "T\nrun      success\na\u{fffd}b\u{fffd}[2J        1\n");
     }
 
     #[test]

@@ -181,15 +181,16 @@ fn has_learned(dir: &Path) -> bool {
     n_metrics > 0 || !checkpoint::list(&run_directory::checkpoints(dir)).is_empty()
 }
 
+/// Reads the summary of the run in `dir`. A damaged one counts as missing: the run, resumed from its last checkpoint,
+/// writes it again.
 fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {
     let path = summary_path(dir);
     if !path.exists() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path);
-    let text = text.with_context(|| format!("cannot read {}", path.display()))?;
-    let summary = serde_json::from_str(&text);
-    summary.map(Some).with_context(|| format!("{} is damaged: remove it", path.display()))
+    let summary = std::fs::read(&path);
+    let summary = summary.with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(serde_json::from_slice(&summary).ok().filter(Json::is_object))
 }
 
 #[cfg(test)]
@@ -242,8 +243,10 @@ mod tests {
         assert_eq!(finished.state, State::Finished(json!({"digest": "d"})));
         assert_eq!(finished.failure, None);
         let of_shorter_run = "{\"digest\": \"d\", \"max_env_steps\": 800}";
-        std::fs::write(summary_path(&finished.dir), of_shorter_run).expect("writes");
-        assert_eq!(status(out, 0.95).expect("fits").state, State::Started);
+        for of_another_run_or_damaged in [of_shorter_run, "{\"digest\": \"d", "", "null"] {
+            std::fs::write(summary_path(&finished.dir), of_another_run_or_damaged).expect("writes");
+            assert_eq!(status(out, 0.95).expect("fits").state, State::Started);
+        }
     }
 
     #[test]
