@@ -33,17 +33,18 @@ impl LogBudget {
         Self { directory, limit_bytes, allowance_bytes: 0 }
     }
 
-    /// Accounts for a new log of `n_bytes` in the directory, and returns the number of logs deleted.
+    /// Accounts for the new log `path` of `n_bytes` in the directory, and returns the number of logs deleted, which are
+    /// others.
     ///
     /// # Errors
     /// If the directory cannot be read or a log cannot be deleted.
-    pub fn add(&mut self, n_bytes: u64) -> Result<usize, Error> {
+    pub fn add(&mut self, path: &Path, n_bytes: u64) -> Result<usize, Error> {
         match self.allowance_bytes.checked_sub(n_bytes) {
             Some(left) => {
                 self.allowance_bytes = left;
                 Ok(0)
             }
-            None => self.enforce(),
+            None => self.enforce_except(Some(path)),
         }
     }
 
@@ -52,6 +53,10 @@ impl LogBudget {
     /// # Errors
     /// If the directory cannot be read or a log cannot be deleted.
     pub fn enforce(&mut self) -> Result<usize, Error> {
+        self.enforce_except(None)
+    }
+
+    fn enforce_except(&mut self, newest: Option<&Path>) -> Result<usize, Error> {
         let mut logs = read_logs(&self.directory)?;
         logs.sort_unstable();
         let mut occupied: u64 = logs.iter().map(|log| log.n_bytes).sum();
@@ -62,7 +67,7 @@ impl LogBudget {
                 if occupied <= kept {
                     break;
                 }
-                if is_being_written(&log.path) {
+                if newest == Some(&*log.path) || is_being_written(&log.path) {
                     continue;
                 }
                 delete(&log.path)?;
@@ -192,6 +197,18 @@ mod tests {
     }
 
     #[test]
+    fn a_new_log_that_is_larger_than_the_limit_stays() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut budget = LogBudget::new(directory.path().to_owned(), 100);
+        for name in ["motion-20261129211303-000001.mcap", "motion-20261129211304-000002.mcap"] {
+            let path = directory.path().join(name);
+            fs::write(&path, [0; 300]).unwrap();
+            budget.add(&path, 300).unwrap();
+            assert_eq!(names(directory.path()), [name]);
+        }
+    }
+
+    #[test]
     fn several_writers_stay_below_the_limit() {
         let directory = tempfile::tempdir().unwrap();
         let (limit, n_writers, n_bytes) = (6_000_u64, 4, 300_u64);
@@ -200,9 +217,10 @@ mod tests {
         let mut largest = 0;
         for number in 0..100_u64 {
             let name = format!("train-000001-{number:06}.mcap");
-            fs::write(directory.path().join(name), vec![0; usize::try_from(n_bytes).unwrap()])
+            fs::write(directory.path().join(&name), vec![0; usize::try_from(n_bytes).unwrap()])
                 .unwrap();
-            writers[usize::try_from(number).unwrap() % n_writers].add(n_bytes).unwrap();
+            let writer = &mut writers[usize::try_from(number).unwrap() % n_writers];
+            writer.add(&directory.path().join(name), n_bytes).unwrap();
             largest = largest.max(names(directory.path()).len() as u64 * n_bytes);
         }
         assert!(largest <= limit + n_writers as u64 * n_bytes, "{largest}");

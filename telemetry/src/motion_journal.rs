@@ -152,7 +152,7 @@ impl MotionJournal {
         let finished = log.recorder.finish(&outcome).and_then(|path| {
             let n_bytes = std::fs::metadata(&path).map_or(0, |metadata| metadata.len());
             tracing::info!(?path, n_bytes, "motion recorded");
-            self.budget.add(n_bytes)
+            self.budget.add(&path, n_bytes)
         });
         let is_good = finished.is_ok();
         self.check(finished.map(drop));

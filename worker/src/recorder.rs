@@ -138,8 +138,9 @@ impl LogWriter {
             // An incomplete log would occupy what may be the last space.
             drop(std::fs::remove_file(format!("{}.part", path.display())));
         }
-        let n_bytes = std::fs::metadata(written?).map_or(0, |metadata| metadata.len());
-        self.budget.add(n_bytes)?;
+        let written = written?;
+        let n_bytes = std::fs::metadata(&written).map_or(0, |metadata| metadata.len());
+        self.budget.add(&written, n_bytes)?;
         Ok(())
     }
 }
