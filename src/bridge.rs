@@ -66,10 +66,12 @@ fn serve(args: BridgeServeArgs) -> Result<(), Failed> {
     runtime.block_on(async move {
         let shutdown = signals::shutdown_token(args.listen.exit_with_stdin)?;
         let clock = Arc::new(clock::BridgeClock::new());
-        let arms = Arms::connect(&args.arms, &cell, clock.clone())?;
         metrics::serve(&args.metrics, &own).await?;
         let plan = watch::Plan::of(&args, &cell, &server_config, live).await?;
-        let listener = service::listen(&args.listen).await?;
+        let bound = service::bind(&args.listen).await?;
+        // Last, because a bridge that fails after it has connected stops arms that another one may move.
+        let arms = Arms::connect(&args.arms, &cell, clock.clone())?;
+        let listener = bound.announce("");
         let config = Config {
             driver: arms::name(args.arms.driver).to_owned(),
             version: VERSION.to_owned(),

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use anyhow::anyhow;
 use tandem_system::DirectoryLock;
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -71,6 +72,15 @@ pub(crate) fn runs_in(parent: &Path) -> Vec<PathBuf> {
 pub(crate) fn lock(directory: &Path) -> Result<Option<DirectoryLock>, Failed> {
     let cannot = || format!("cannot lock {}", directory.display());
     DirectoryLock::try_take(directory).or_exit(Exit::TryAgain, cannot)
+}
+
+/// Locks a directory that `option` names, or refuses it while another process uses it.
+pub(crate) fn lock_for(option: &str, directory: &Path) -> Result<DirectoryLock, Failed> {
+    lock(directory)?.ok_or_else(|| {
+        let directory = directory.display();
+        let advice = format!("wait until it exits, or choose another {option}");
+        Failed::new(Exit::TryAgain, anyhow!("another process uses {directory}: {advice}"))
+    })
 }
 
 /// Rejects a path at which no directory can be created: a file, or a path below one.

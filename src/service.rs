@@ -14,7 +14,7 @@ use crate::runtime;
 
 pub(crate) use environment::environment;
 pub(crate) use learner::learner;
-pub(crate) use listen::listen;
+pub(crate) use listen::{bind, listen};
 pub(crate) use relay::relay;
 pub(crate) use teacher::{policy_address, teacher, teacher_failed};
 pub(crate) use worker::{worker, worker_failed};

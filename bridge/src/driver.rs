@@ -41,6 +41,12 @@ pub trait Driver {
     /// # Errors
     /// Returns an error if the command could not be sent. The drives then brake after [`SILENCE_S`] without commands.
     fn stop(&mut self) -> Result<(), DriverError>;
+
+    /// Returns whether the arms have confirmed the last order to stop, as far as they answer orders. Arms that only send
+    /// states confirm it with the next one.
+    fn confirms_stop(&self) -> bool {
+        true
+    }
 }
 
 impl<D: Driver + ?Sized> Driver for Box<D> {
@@ -54,6 +60,10 @@ impl<D: Driver + ?Sized> Driver for Box<D> {
 
     fn stop(&mut self) -> Result<(), DriverError> {
         (**self).stop()
+    }
+
+    fn confirms_stop(&self) -> bool {
+        (**self).confirms_stop()
     }
 }
 

@@ -19,6 +19,7 @@
 use tandem_kinematics::{Excess, Joints, Motion, WorkCell};
 
 use crate::driver::{Driver, DriverError, Order, PairState};
+use crate::executor::answers::Answers;
 use crate::executor::commands::CommandHistory;
 use crate::executor::envelope::Envelope;
 use crate::executor::lease::Lease;
@@ -36,6 +37,8 @@ pub use stop::{Stop, StopCause};
 
 pub(crate) use errors::GOOD_STATES;
 
+mod accessors;
+mod answers;
 mod checked;
 mod commands;
 mod envelope;
@@ -46,6 +49,9 @@ mod playback;
 mod settings;
 mod state;
 mod stop;
+
+/// Time without a new state after which the arms count as disconnected, although commands can be sent, seconds.
+const LOST_S: f64 = 1.0;
 
 /// Moves a pair of arms. The executor is the only user of their driver.
 #[derive(Debug)]
@@ -60,6 +66,7 @@ pub struct Executor<D: Driver> {
     envelope: Envelope,
     state: ArmsState,
     commands: CommandHistory,
+    answers: Answers,
     /// The newest cause of a stop after the one that stopped the arms.
     later_stop: Option<Stop>,
     ticked_s: Option<f64>,
@@ -83,6 +90,7 @@ impl<D: Driver> Executor<D> {
             envelope: Envelope::new(&cell, &settings, period_s),
             state: ArmsState::Stopped(StopCause::NotReset.anywhere().at(0.0)),
             commands: CommandHistory::new(&cell, &settings, period_s),
+            answers: Answers::default(),
             later_stop: None,
             ticked_s: None,
             stop_error: None,
@@ -203,9 +211,12 @@ impl<D: Driver> Executor<D> {
         self.state = ArmsState::Playing { playback, holding: false };
     }
 
-    /// Stops the arms on request. No ownership is needed.
+    /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns whether
+    /// the arms have answered.
     pub fn stop(&mut self, now_s: f64) {
         self.halt(StopCause::Requested.anywhere(), now_s);
+        // The next command repeats the order, under a number of its own.
+        self.answers.await_stop(self.commands.number() + 1);
     }
 
     /// Stops the arms because the program that ticks the executor is about to end.
@@ -216,25 +227,41 @@ impl<D: Driver> Executor<D> {
     /// Makes stopped arms idle. They hold their position until a motion is started.
     ///
     /// # Errors
-    /// Returns an error if the client with `token` does not own the arms, or their states are not good.
+    /// Returns an error if the client with `token` does not own the arms, their states are not good, or they are beyond
+    /// a limit at which they would be stopped again.
     pub fn reset(&mut self, token: Token, now_s: f64) -> Result<(), ResetError> {
         self.renew(token, now_s)?;
         if self.phase() != Phase::Stopped {
             return Err(ResetError::NotStopped(self.phase()));
         }
+        if let Some(error) = &self.exchange_error {
+            return Err(ResetError::Driver(error.clone()));
+        }
         let got = self.monitor.n_good();
-        let stale = self.monitor.stale_s(now_s) > self.settings.state_hold_s;
+        let stale_s = self.monitor.stale_s(now_s);
+        let stale = stale_s > self.settings.state_hold_s;
         let state = self.monitor.state().filter(|_| got >= GOOD_STATES && !stale);
         let Some(state) = state else {
             let reported = self.monitor.reported().filter(|_| !stale);
-            return Err(reported.unwrap_or(ResetError::States { got }));
+            return Err(reported.unwrap_or_else(|| self.too_few_states(got, now_s)));
         };
         if !self.monitor.at_rest() {
             return Err(ResetError::Moving);
         }
         self.commands.keep_openings(state);
+        let commands = self.commands.stationary();
+        let checked = self.envelope.check(&commands, self.commands.velocities(), state, stale_s);
+        if let Err(Breach { arm, cause, .. }) = checked {
+            return Err(ResetError::Limit { arm, cause });
+        }
         self.state = ArmsState::Idle { at: state.arms.iter().map(|arm| arm.angles).collect() };
         Ok(())
+    }
+
+    fn too_few_states(&self, got: u32, now_s: f64) -> ResetError {
+        let is_new = |stop: &&Stop| got == 0 && now_s - stop.when_s <= self.settings.state_stop_s;
+        let rejected = self.later_stop.as_ref().filter(is_new).map(|stop| stop.cause.clone());
+        ResetError::States { got, rejected }
     }
 
     /// Replaces a driver that has failed by one with a new connection to the same arms. The arms stay stopped, the
@@ -256,6 +283,7 @@ impl<D: Driver> Executor<D> {
         self.driver = driver;
         self.monitor = Monitor::new(&self.cell, &self.settings, self.period_s);
         self.commands.restart();
+        self.answers.restart();
         (self.stop_error, self.exchange_error) = (None, None);
         Ok(())
     }
@@ -268,6 +296,9 @@ impl<D: Driver> Executor<D> {
         });
         let command = self.commands.push(order);
         match self.driver.exchange(&command) {
+            Ok(state) if self.answers.note(&state, command.number, now_s) > LOST_S => {
+                self.lose(now_s);
+            }
             Ok(state) => {
                 (self.stop_error, self.exchange_error) = (None, None);
                 let velocities = self.commands.visible_velocities();
@@ -284,89 +315,6 @@ impl<D: Driver> Executor<D> {
             }
         }
         self.phase()
-    }
-
-    /// The phase of the arms.
-    #[must_use]
-    pub fn phase(&self) -> Phase {
-        self.state.phase()
-    }
-
-    /// The stop that the arms are in, while they are stopped.
-    #[must_use]
-    pub fn stopped_by(&self) -> Option<&Stop> {
-        self.state.stop()
-    }
-
-    /// The newest cause of a stop while the arms are stopped: the one that stopped them, or a later one that would have.
-    #[must_use]
-    pub fn newest_stop(&self) -> Option<&Stop> {
-        self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))
-    }
-
-    /// The error of the last attempt to stop the drives, until a command gets through.
-    #[must_use]
-    pub fn stop_error(&self) -> Option<&DriverError> {
-        self.stop_error.as_ref()
-    }
-
-    /// The error of the last exchange, if it failed. A driver that has failed may never work again.
-    #[must_use]
-    pub fn exchange_error(&self) -> Option<&DriverError> {
-        self.exchange_error.as_ref()
-    }
-
-    /// The number of consecutive good states.
-    #[must_use]
-    pub fn n_good(&self) -> u32 {
-        self.monitor.n_good()
-    }
-
-    /// The time until the present lease ends unless it is renewed, seconds; `None` if the arms have no owner.
-    #[must_use]
-    pub fn lease_left_s(&self, now_s: f64) -> Option<f64> {
-        let left_s = self.settings.lease_s - self.lease.silent_s(now_s);
-        (left_s > 0.0).then_some(left_s)
-    }
-
-    /// The progress of the present motion.
-    #[must_use]
-    pub fn progress(&self) -> Option<Progress> {
-        let playback = self.state.playback()?;
-        let (played_s, duration_s) = (playback.played_s(), playback.duration_s());
-        Some(Progress { played_s, duration_s })
-    }
-
-    /// The joint angles that the present motion prescribes now, radians, arm by arm.
-    #[must_use]
-    pub fn reference(&self) -> Option<&[Joints]> {
-        self.state.playback().map(Playback::reference)
-    }
-
-    /// The commanded openings of the grippers, arm by arm; `None` while the arms are stopped. A gripper that holds an
-    /// object is open wider than commanded.
-    #[must_use]
-    pub fn openings(&self) -> Option<Vec<f64>> {
-        let is_stopped = self.phase() == Phase::Stopped;
-        (!is_stopped).then(|| self.commands.last().iter().map(|arm| arm.opening).collect())
-    }
-
-    /// The driver, for inspection.
-    #[must_use]
-    pub fn driver(&self) -> &D {
-        &self.driver
-    }
-
-    /// The newest valid state of the arms.
-    #[must_use]
-    pub fn state(&self) -> Option<&PairState> {
-        self.monitor.state()
-    }
-
-    /// Returns whether all joints were at rest in the newest state.
-    #[must_use]
-    pub fn at_rest(&self) -> bool {
-        self.monitor.at_rest()
     }
 
     /// Returns the order of the coming period, or the limit that it would break.
@@ -434,6 +382,17 @@ impl<D: Driver> Executor<D> {
             return Err(StopCause::NotSettled(Excess { got, allowed }).anywhere());
         }
         Ok(())
+    }
+
+    /// Counts silent arms as disconnected until a new state arrives, and forgets where they were.
+    fn lose(&mut self, now_s: f64) {
+        if self.exchange_error.is_some() {
+            return;
+        }
+        let error = DriverError::Disconnected { what: format!("no new state for {LOST_S} s") };
+        self.exchange_error = Some(error.clone());
+        self.monitor.forget();
+        self.halt(StopCause::Driver(error).anywhere(), now_s);
     }
 
     /// Stops the arms in the fastest way. Keeps the first cause and the newest one.

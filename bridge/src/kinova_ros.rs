@@ -420,6 +420,11 @@ impl Driver for KinovaRosDriver {
     fn stop(&mut self) -> Result<(), DriverError> {
         self.unless_failed(|driver| (0..driver.arms.len()).try_for_each(|arm| driver.stop_arm(arm)))
     }
+
+    /// Returns whether every node has answered the call of `in/stop`.
+    fn confirms_stop(&self) -> bool {
+        self.failure.is_none() && self.arms.iter().all(|arm| arm.control == Control::Stopped)
+    }
 }
 
 /// Handles a message of rosbridge.

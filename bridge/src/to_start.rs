@@ -162,7 +162,7 @@ impl Arms<'_> {
                     return Err(ToStartError::Driver(error.clone()));
                 }
                 let error = match self.executor.at_rest() {
-                    true => ResetError::States { got },
+                    true => ResetError::States { got, rejected: None },
                     false => ResetError::Moving,
                 };
                 return Err(ToStartError::Reset(error));

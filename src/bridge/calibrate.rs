@@ -11,6 +11,7 @@ use tandem_system::atomic_file;
 use tokio_util::sync::CancellationToken;
 
 use super::cell::{self, Cell};
+use super::first_day::confirm;
 use super::{arms, priority, runtime};
 use crate::cli::{CalibrateArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -22,9 +23,15 @@ pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
         return Err(Failed::usage("--cell FILE is missing: write one with `tandem bridge cell`"));
     };
     let cell = Cell::load(Some(&path))?;
+    if args.arms.driver != DriverName::Sim {
+        let question = "Every joint of both arms turns by some degrees and back. Somebody watches them with a hand on \
+                        the emergency stop, and nothing stands in their way";
+        // Nothing handles Ctrl-C yet, so that it ends the process.
+        confirm(args.confirmation.yes, question, "yes", &CancellationToken::new())?;
+    }
     let runtime = runtime().or_exit(Exit::TryAgain, String::new)?;
     let names: Vec<String> = cell.file.arms.iter().map(|arm| arm.name.clone()).collect();
-    let json = args.json;
+    let json = args.confirmation.json;
     let measured = runtime.block_on(async move {
         let interrupted = signals::shutdown_token(false)?;
         let measuring =
@@ -79,9 +86,6 @@ fn measure_arms(
         priority::raise_if_permitted();
     } else {
         priority::raise();
-        output::message(
-            "tandem: every joint of both arms turns by some degrees: keep a hand on the emergency stop",
-        );
     }
     let mut report = |joint: JointTiming| {
         let name = &cell.file.arms[joint.arm.0].name;

@@ -167,7 +167,7 @@ fn block_on<T: Send + 'static>(
 }
 
 /// Asks the operator to type `answer`, unless that was done on the command line.
-fn confirm(
+pub(super) fn confirm(
     is_given: bool,
     question: &str,
     answer: &str,

@@ -100,16 +100,7 @@ fn locked_directory(out: Option<&Path>, task: Task) -> Result<(PathBuf, Director
         |out: &Path| std::fs::metadata(out.join(TRIALS_FILE)).is_ok_and(|file| file.len() > 0);
     if let Some(out) = out {
         create_directory(out)?;
-        let lock = run_directory::lock(out)?.ok_or_else(|| {
-            Failed::new(
-                Exit::TryAgain,
-                anyhow::anyhow!(
-                    "another process uses {}: wait until it exits, or choose another --out",
-                    out.display()
-                ),
-            )
-        })?;
-        return Ok((out.to_owned(), lock));
+        return Ok((out.to_owned(), run_directory::lock_for("--out", out)?));
     }
     let base = format!("runs/trial-{task}");
     let mut out = PathBuf::from(&base);

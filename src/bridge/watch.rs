@@ -15,6 +15,7 @@ use tandem_core::text::error_chain;
 use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
 use tandem_kinematics::WorkCell;
 use tandem_net::{ServerConfig, Token};
+use tandem_system::DirectoryLock;
 use tandem_telemetry::live::LiveArms;
 use tandem_telemetry::{ArmsView, MotionJournal};
 use tokio::net::TcpListener;
@@ -26,7 +27,7 @@ use super::{arms, view};
 use crate::cli::BridgeServeArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::version::VERSION;
-use crate::{access, dashboard, output};
+use crate::{access, dashboard, output, run_directory};
 
 /// States that wait for the thread that views them, about ten seconds. Further ones are lost and counted.
 const QUEUE_CAPACITY: usize = 1024;
@@ -40,7 +41,7 @@ const END_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Everything that the command line asks for, before the arms are ticked.
 pub(super) struct Plan {
-    journal: Option<MotionJournal>,
+    journal: Option<(MotionJournal, DirectoryLock)>,
     live: Option<LiveArms>,
     page: Option<Page>,
 }
@@ -78,7 +79,9 @@ impl Plan {
         let access = page_access(args, server_config.token())?;
         let journal = args.record.as_ref().map(|directory| {
             let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args, cell));
-            journal.map_err(Failed::of_write)
+            let journal = journal.map_err(Failed::of_write)?;
+            // The logs of two bridges could have the same names.
+            Ok((journal, run_directory::lock_for("--record", directory)?))
         });
         let journal = journal.transpose()?;
         let page = match access {
@@ -113,9 +116,14 @@ impl Plan {
         let page = self.page.map(|page| page.serve(args, operator, receiver));
         let (end, ended) = sync_channel(1);
         let journal = match self.journal {
-            Some(journal) => {
+            Some((journal, lock)) => {
                 let (queue, waiting) = sync_channel(QUEUE_CAPACITY);
-                spawn("recorder", move || record(journal, &waiting, &end))?;
+                spawn("recorder", move || {
+                    record(journal, &waiting);
+                    drop(lock);
+                    // Fails only if the bridge has not waited.
+                    end.send(()).ok();
+                })?;
                 Some(queue)
             }
             None => None,
@@ -188,13 +196,11 @@ impl Viewer {
 }
 
 /// Writes logs until the sender of states is gone.
-fn record(mut journal: MotionJournal, views: &Receiver<Arc<ArmsView>>, end: &SyncSender<()>) {
+fn record(mut journal: MotionJournal, views: &Receiver<Arc<ArmsView>>) {
     for view in views {
         journal.record(&view);
     }
     journal.finish();
-    // Fails only if the bridge has not waited.
-    end.send(()).ok();
 }
 
 impl Page {

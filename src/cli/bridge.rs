@@ -141,7 +141,7 @@ Examples:
   tandem bridge status
   tandem bridge status --connect lab:7002 --token-file token --json")]
     Status(OperatorArgs),
-    /// Stops the arms. Exit code 0 means that the drives received the command.
+    /// Stops the arms. Exit code 0 means that the arms have confirmed it.
     #[command(after_help = "\
 Examples:
   tandem bridge stop
@@ -202,7 +202,7 @@ Examples:
   tandem bridge calibrate --driver quarc --arms-at tcpip://10.0.0.5:18000 \\
       --cell cell.toml --speed 0.1
 
-One joint after the other turns by up to 6 degrees and back. The arms need room, and no bridge may \
+Asks first whether a person watches real arms. One joint after the other turns by up to 6 degrees and back. The arms need room, and no bridge may \
 be connected to them. Other keys of the file and its comments stay as they are. Ctrl-C stops the arms."
 )]
 pub(crate) struct CalibrateArgs {
@@ -211,9 +211,8 @@ pub(crate) struct CalibrateArgs {
     /// Speed, as a fraction of each joint's highest, 0.1 to 0.5.
     #[arg(long, default_value_t = 0.3, value_parser = calibration_speed)]
     pub(crate) speed: f64,
-    /// Prints one JSON object.
-    #[arg(long)]
-    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) confirmation: ConfirmationArgs,
 }
 
 #[derive(Debug, Args)]

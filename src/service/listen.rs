@@ -1,6 +1,7 @@
 //! The address of a service.
 
 use std::io::ErrorKind;
+use std::net::SocketAddr;
 
 use tandem_net::{Capacity, Incoming};
 use tandem_system::fd_limit;
@@ -10,18 +11,38 @@ use crate::cli::ListenArgs;
 use crate::exit::{Exit, Failed};
 use crate::output;
 
-/// Binds the address and prints it as one line of standard output. If that line cannot be written, the service runs all
-/// the same. The service keeps as many connections as the limit of open files allows.
+/// A bound address that is not announced yet.
+pub(crate) struct Bound {
+    incoming: Incoming,
+    address: SocketAddr,
+}
+
+impl Bound {
+    /// Prints the address, after `scheme`, as one line of standard output. If that line cannot be written, the service runs
+    /// all the same.
+    pub(crate) fn announce(self, scheme: &str) -> Incoming {
+        let Self { incoming, address } = self;
+        if let Err(failed) = output::print(format_args!("listening on {scheme}{address}")) {
+            let error = failed.into_error();
+            tracing::warn!(%address, "cannot print the address: {error:#}");
+        }
+        incoming
+    }
+}
+
+/// Binds the address and prints it.
 pub(crate) async fn listen(args: &ListenArgs) -> Result<Incoming, Failed> {
-    listen_as("", args).await
+    Ok(bind(args).await?.announce(""))
 }
 
 /// Binds the address as [`listen`] and prints it as a URI, which is the contract for environment servers.
 pub(super) async fn listen_with_scheme(args: &ListenArgs) -> Result<Incoming, Failed> {
-    listen_as(if args.tls_cert.is_some() { "https://" } else { "http://" }, args).await
+    let scheme = if args.tls_cert.is_some() { "https://" } else { "http://" };
+    Ok(bind(args).await?.announce(scheme))
 }
 
-async fn listen_as(scheme: &str, args: &ListenArgs) -> Result<Incoming, Failed> {
+/// Binds the address. The service keeps as many connections as the limit of open files allows.
+pub(crate) async fn bind(args: &ListenArgs) -> Result<Bound, Failed> {
     let capacity = Capacity::for_open_files(fd_limit::raise());
     let bind = async {
         let listener = TcpListener::bind(args.listen).await?;
@@ -29,11 +50,7 @@ async fn listen_as(scheme: &str, args: &ListenArgs) -> Result<Incoming, Failed> 
         Ok::<_, std::io::Error>((listener, address))
     };
     let (listener, address) = bind.await.map_err(|error| cannot_listen(args, error))?;
-    if let Err(failed) = output::print(format_args!("listening on {scheme}{address}")) {
-        let error = failed.into_error();
-        tracing::warn!(%address, "cannot print the address: {error:#}");
-    }
-    Ok(Incoming::from(listener).with_capacity(capacity))
+    Ok(Bound { incoming: Incoming::from(listener).with_capacity(capacity), address })
 }
 
 fn cannot_listen(args: &ListenArgs, error: std::io::Error) -> Failed {

@@ -70,6 +70,9 @@ fn nanoseconds(seconds: f64) -> u64 {
 fn a_stopped_motion_leaves_a_log_with_the_reported_angles_and_the_cause() {
     let directory = tempfile::tempdir().expect("a directory");
     let bridge = Bridge::serve(&["--record", &directory.path().to_string_lossy()]);
+    let mut second = tandem(&SERVE);
+    let second = second.arg("--record").arg(directory.path()).output().expect("runs");
+    fails_with(75, &second, "choose another --record");
     let (reported, stopped) = bridge.with_arms(|| {
         let mover = bridge.moving()?;
         let reported: Vec<Value> = (0..3).map(|_| bridge.status()).collect();

@@ -219,6 +219,12 @@ fn real_arms_need_measured_times_and_a_cell_is_refused_with_its_key() {
     let guessed = [&real[..], &["--cell", &cell]].concat();
     refused(&guessed, 64, "no lag_s, reaction_s and brake_s of left and right: measure");
     refused(&[&guessed[..], &["--accept-defaults"]].concat(), 75, "not connected");
+    // The port is taken before the arms are, whose motion a second bridge would stop.
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("binds");
+    let taken = taken.local_addr().expect("is bound").to_string();
+    let second = [&guessed[..], &["--accept-defaults", "--listen", &taken]].concat();
+    refused(&second, 75, "cannot listen on");
+    refused(&[&["calibrate"], &guessed[..]].concat(), 64, "confirm with --yes");
     refused(
         &["to-start", "--yes", real[0], real[1], real[2], real[3]],
         64,

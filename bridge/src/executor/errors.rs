@@ -3,6 +3,7 @@
 use tandem_core::ArmIndex;
 use tandem_kinematics::{Excess, Refusal};
 
+use crate::driver::DriverError;
 use crate::executor::checked::CheckError;
 use crate::executor::lease::LeaseError;
 use crate::executor::state::Phase;
@@ -62,6 +63,12 @@ impl From<CheckError> for StartError {
     }
 }
 
+/// Returns what a message says about the newest state.
+fn advice(rejected: Option<&StopCause>) -> String {
+    rejected
+        .map_or_else(|| "try again".to_owned(), |cause| format!("the newest has a fault: {cause}"))
+}
+
 /// The reason why stopped arms were not reset.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -80,11 +87,24 @@ pub enum ResetError {
         /// The cause for which the arms would be stopped again.
         cause: StopCause,
     },
+    /// There is no connection to the arms.
+    #[error(transparent)]
+    Driver(DriverError),
+    /// An arm is beyond a limit at which it would be stopped again.
+    #[error("{}{cause}: move the arm clear by hand, or correct the cell file", .arm.map_or_else(String::new, |arm| format!("arm {}: ", arm.0)))]
+    Limit {
+        /// The arm, if the limit concerns one.
+        arm: Option<ArmIndex>,
+        /// The cause for which the arms would be stopped again.
+        cause: StopCause,
+    },
     /// There have been too few consecutive good states.
-    #[error("{got} good states in a row, at least {GOOD_STATES} are needed: try again")]
+    #[error("{got} good states in a row, at least {GOOD_STATES} are needed: {}", advice(.rejected.as_ref()))]
     States {
         /// The number of consecutive good states.
         got: u32,
+        /// Why the newest state is not good, if it is not.
+        rejected: Option<StopCause>,
     },
     /// A joint still moves.
     #[error("the arms still move")]

@@ -116,14 +116,16 @@ impl Monitor {
             self.n_good = if reported.is_ok() { self.n_good + 1 } else { 0 };
             self.newest = Some(ReceivedState { state, at_s: now_s });
         } else {
-            // The next state starts a new sequence: the cause of this stop is already recorded.
-            let settings = self.settings;
-            let models = std::mem::take(&mut self.models);
-            let n_equal = vec![[0; MAX_JOINTS]; models.len()];
-            let (newest, usual_delay_s) = (None, f64::INFINITY);
-            *self = Self { models, settings, newest, usual_delay_s, n_equal, n_good: 0, ..*self };
+            // The cause of this stop is already recorded.
+            self.forget();
         }
         reported.and(measured)
+    }
+
+    /// Forgets all states: the next one starts a new sequence.
+    pub(crate) fn forget(&mut self) {
+        self.n_equal.fill([0; MAX_JOINTS]);
+        (self.newest, self.usual_delay_s, self.n_good) = (None, f64::INFINITY, 0);
     }
 
     /// Checks that the arms report no fault and no torque beyond the limit.

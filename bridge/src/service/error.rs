@@ -43,6 +43,11 @@ pub enum Error {
     /// The drives could not be commanded to stop.
     #[error("the drives could NOT be commanded to stop, use the emergency stop: {0}")]
     StopFailed(#[source] DriverError),
+    /// The arms have not confirmed the order to stop.
+    #[error(
+        "the order to stop was sent, but the arms have not confirmed it within {0:?}: use the emergency stop"
+    )]
+    StopUnconfirmed(Duration),
     /// The thread that moves the arms has not answered.
     #[error("the thread that moves the arms has not answered within {0:?}: see the status")]
     Timeout(Duration),
@@ -99,7 +104,7 @@ pub(super) fn status(error: &Error) -> Status {
         Error::StreamBroken(status) => Status::new(status.code(), message),
         Error::Busy => Status::resource_exhausted(message),
         Error::ShuttingDown | Error::Reconnect(_) => Status::unavailable(message),
-        Error::Timeout(_) | Error::StopFailed(_) => {
+        Error::Timeout(_) | Error::StopFailed(_) | Error::StopUnconfirmed(_) => {
             tracing::error!(%error, "request failed");
             Status::unavailable(message)
         }

@@ -43,7 +43,8 @@ pub(super) fn add_state(metrics: &Metrics, arms: ArmsHandle) {
         }
         registry.register("bridge_phase", "1 for the present phase of the arms", phase);
         let is_connected = f64::from(u8::from(!newest.exchange_failed));
-        let help = "1 while the driver exchanges commands and states with the arms";
+        let help =
+            "1 while commands can be sent and the arms have sent a state within the last second";
         gauge(registry, "bridge_driver_connected", help, is_connected);
         let help = "Calls that wait for the ticking thread";
         gauge(registry, "bridge_queue_depth", help, arms.n_waiting() as f64);

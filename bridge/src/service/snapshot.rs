@@ -24,6 +24,8 @@ pub struct Snapshot {
     pub exchange_failed: bool,
     /// The error of the last attempt to stop the drives, until a command gets through.
     pub stop_error: Option<DriverError>,
+    /// Whether the arms have confirmed the last requested stop.
+    pub(super) stop_is_confirmed: bool,
     /// The time until the owner's lease ends unless it is renewed, seconds; `None` if the arms have no owner.
     pub lease_left_s: Option<f64>,
     /// Whether all joints were at rest in the newest state.
@@ -170,6 +172,7 @@ mod tests {
                 stopped: None,
                 exchange_failed: false,
                 stop_error: None,
+                stop_is_confirmed: true,
                 lease_left_s: None,
                 at_rest: true,
                 state: None,

@@ -36,6 +36,8 @@ const CAPACITY: usize = 64;
 const MAX_JOBS: u32 = 8;
 /// The longest time that a call waits for the thread.
 const CALL_TIMEOUT: Duration = Duration::from_secs(2);
+/// The longest time in which the arms confirm a stop.
+const CONFIRM_TIMEOUT: Duration = Duration::from_secs(1);
 /// The largest number of ticks in which the arms come to rest when the service shuts down.
 const SHUTDOWN_TICKS: u32 = 50;
 
@@ -257,10 +259,11 @@ impl ArmsHandle {
         self.snapshots.clone()
     }
 
-    /// Stops the arms before all waiting jobs. Returns the snapshot after the stop.
+    /// Stops the arms before all waiting jobs, and waits until they confirm it. Returns the snapshot after that.
     ///
     /// # Errors
-    /// Returns an error if the drives could not be commanded to stop, or the thread does not respond.
+    /// Returns an error if the drives could not be commanded to stop or do not confirm it, or the thread does not
+    /// respond.
     pub(super) async fn stop(&self) -> Result<Arc<Snapshot>, Error> {
         let number = self.n_stops_requested.fetch_add(1, Ordering::AcqRel) + 1;
         let mut snapshots = self.snapshots.clone();
@@ -275,8 +278,15 @@ impl ArmsHandle {
         };
         let timed_out = |_elapsed| Err(Error::Timeout(CALL_TIMEOUT));
         let newest = tokio::time::timeout(CALL_TIMEOUT, stopped).await.unwrap_or_else(timed_out)?;
+        let is_answered =
+            |newest: &Arc<Snapshot>| newest.stop_error.is_some() || newest.stop_is_confirmed;
+        let newest = match is_answered(&newest) {
+            true => newest,
+            false => self.wait_for(CONFIRM_TIMEOUT, is_answered).await,
+        };
         match &newest.stop_error {
             Some(error) => Err(Error::StopFailed(error.clone())),
+            None if !newest.stop_is_confirmed => Err(Error::StopUnconfirmed(CONFIRM_TIMEOUT)),
             None => Ok(newest),
         }
     }
@@ -286,8 +296,16 @@ impl ArmsHandle {
         &self,
         condition: impl FnMut(&Arc<Snapshot>) -> bool,
     ) -> Arc<Snapshot> {
+        self.wait_for(CALL_TIMEOUT, condition).await
+    }
+
+    async fn wait_for(
+        &self,
+        timeout: Duration,
+        condition: impl FnMut(&Arc<Snapshot>) -> bool,
+    ) -> Arc<Snapshot> {
         let mut snapshots = self.snapshots.clone();
-        match tokio::time::timeout(CALL_TIMEOUT, snapshots.wait_for(condition)).await {
+        match tokio::time::timeout(timeout, snapshots.wait_for(condition)).await {
             Ok(Ok(met)) => Arc::clone(&met),
             Ok(Err(_)) | Err(_) => self.newest(),
         }
@@ -322,6 +340,7 @@ fn snapshot(executor: &Executor<BoxDriver>, now_s: f64) -> Snapshot {
         stopped: executor.stopped_by().cloned(),
         exchange_failed: executor.exchange_error().is_some(),
         stop_error: executor.stop_error().cloned(),
+        stop_is_confirmed: executor.stop_is_confirmed(),
         lease_left_s: executor.lease_left_s(now_s),
         at_rest: executor.at_rest(),
         state: executor.state().cloned(),

@@ -44,7 +44,7 @@ fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
         }
         assert_eq!(test.rig.executor.stopped_by().unwrap().cause, cause);
         let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
-        assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
+        assert!(matches!(reset, Err(ResetError::Driver(_))), "{reset:?}");
     };
     ends(Fault::Null, "/left/m1n4s200_driver: position of m1n4s200_joint_2 is null");
     ends(Fault::Nan, "not JSON");
@@ -109,11 +109,11 @@ fn a_service_that_fails_or_does_not_respond_ends_the_connection() {
         test.side.begin(fault);
         test.rig.executor.stop(test.rig.now_s);
         test.assert_rests();
-        // Only the first stop is reported. The states show that the connection has ended.
-        eventually("states are missing", || {
+        // Only the first stop is reported. Resets show that the connection has ended.
+        eventually("the connection has ended", || {
             test.rig.tick();
             let reset = test.rig.executor.reset(OWNER, test.rig.now_s);
-            matches!(reset, Err(ResetError::States { .. }))
+            matches!(reset, Err(ResetError::Driver(_)))
         });
         let Test { side, .. } = test;
         let mut driver = connected(&side);

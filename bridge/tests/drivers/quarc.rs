@@ -83,7 +83,7 @@ impl Test {
         // The first stop is kept, and a reset fails: this driver cannot be used again.
         assert_eq!(self.rig.executor.stopped_by().unwrap().cause, cause);
         let reset = self.rig.executor.reset(OWNER, self.rig.now_s);
-        assert!(matches!(reset, Err(ResetError::States { .. })), "{reset:?}");
+        assert!(matches!(reset, Err(ResetError::Driver(_))), "{reset:?}");
         assert_eq!(angles(&self.side.pair), rested);
     }
 }

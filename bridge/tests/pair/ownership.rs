@@ -1,5 +1,7 @@
 //! Ownership, phases and timing.
 
+use std::rc::Rc;
+
 use tandem_bridge::work_cell::mico_cell;
 use tandem_bridge::{
     Executor, LeaseError, Phase, ResetError, Settings, StartError, StopCause, Token,
@@ -8,7 +10,7 @@ use tandem_core::ArmIndex;
 use tandem_kinematics::Reason;
 use tandem_trials::SimulatedConfig;
 
-use crate::pair::injection::Kind;
+use crate::pair::injection::{Kind, Tap};
 use crate::pair::rig::{OWNER, Rig, TASKS, walk};
 
 const STRANGER: Token = Token(5);
@@ -27,7 +29,7 @@ fn nothing_moves_before_a_reset_by_the_owner() {
     rig.executor.acquire(OWNER, rig.now_s).unwrap();
     assert_eq!(start(&mut rig), Err(StartError::NotIdle(Phase::Stopped)));
     let reset = rig.executor.reset(OWNER, rig.now_s);
-    assert_eq!(reset, Err(ResetError::States { got: 0 }));
+    assert_eq!(reset, Err(ResetError::States { got: 0, rejected: None }));
     for _ in 0..20 {
         assert_eq!(rig.tick(), Phase::Stopped);
     }
@@ -226,11 +228,31 @@ fn only_its_owner_renews_a_lease_which_reports_its_remaining_time() {
 }
 
 #[test]
-fn a_reset_after_a_driver_failure_requires_new_good_states() {
+fn a_reset_is_refused_where_the_arms_would_be_stopped_again() {
+    let motion = walk(TASKS, 8, 3);
+    let mut rig = Rig::new(&motion, config());
+    let mut cell = mico_cell();
+    cell.table_z_m += 0.5;
+    let tap = Tap::new(Rc::clone(&rig.pair), Rc::clone(&rig.injection));
+    rig.executor = Executor::new(cell, tap, Settings::default()).unwrap();
+    rig.executor.acquire(OWNER, rig.now_s).unwrap();
+    for _ in 0..15 {
+        rig.tick();
+    }
+    let reset = rig.executor.reset(OWNER, rig.now_s);
+    let Err(ResetError::Limit { arm: Some(_), cause: StopCause::TableGap(_) }) = reset else {
+        panic!("{reset:?}");
+    };
+    assert_eq!(rig.tick(), Phase::Stopped);
+    assert_eq!(rig.executor.stopped_by().unwrap().cause, StopCause::NotReset, "not stopped again");
+}
+
+#[test]
+fn a_reset_after_a_driver_failure_is_refused() {
     let motion = walk(TASKS, 8, 3);
     let mut rig = Rig::ready(&motion, config());
     rig.injection.borrow_mut().begin(Kind::DriverError, ArmIndex(0), 0);
     assert_eq!(rig.tick(), Phase::Stopped);
     let reset = rig.executor.reset(OWNER, rig.now_s);
-    assert_eq!(reset, Err(ResetError::States { got: 0 }), "what was seen last is not old yet");
+    assert!(matches!(reset, Err(ResetError::Driver(_))), "what was seen last is not old yet");
 }

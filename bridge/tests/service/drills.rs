@@ -69,7 +69,7 @@ async fn drill(fault: F, moving: bool, name: &str, place: [Option<u32>; 2]) {
             F::DriveFault => "arm 1: a drive reports a fault",
             F::Contact => "arm 1: a contact is reported",
             F::Torque => "arm 1: an unexplained torque of ",
-            _ => "good states in a row",
+            _ => "the newest has a fault: ",
         };
         let refused = reset.unwrap_err();
         assert!(refused.message().contains(expected), "{refused}");

@@ -96,6 +96,8 @@ pub(crate) enum Fault {
     Hang,
     /// The present connection never works again; new ones do.
     Lost,
+    /// Commands are lost, and the last state is returned again and again.
+    Silent,
     /// States contain NaN.
     Untrue,
 }
@@ -108,6 +110,8 @@ pub(crate) struct Bench {
     /// The number of stops outside of exchanges.
     n_stops: usize,
     newest: Order,
+    /// The last state.
+    last: Option<PairState>,
     /// The connection that works, counted from 0.
     connection: usize,
     /// The first command of the present connection.
@@ -128,7 +132,8 @@ impl Tap {
         let drill = Drill::new(injector, settings);
         let (fault, newest) = (Fault::None, Order::Stop);
         let (n_stops, connection, first, widest) = (0, 0, None, 0.0);
-        let bench = Bench { pair, drill, fault, n_stops, newest, connection, first, widest };
+        let last = None;
+        let bench = Bench { pair, drill, fault, n_stops, newest, last, connection, first, widest };
         Self(Arc::new((Mutex::new(bench), Condvar::new())), 0)
     }
 
@@ -203,8 +208,11 @@ impl Driver for Tap {
                 }
                 let Bench { pair, drill, .. } = &mut *bench;
                 drill.apply(pair);
-                Ok(drill.delayed(pair.exchange(command)?))
+                let state = drill.delayed(pair.exchange(command)?);
+                bench.last = Some(state.clone());
+                Ok(state)
             }
+            Fault::Silent => Ok(bench.last.clone().expect("an exchange before the fault")),
             Fault::Untrue => {
                 let mut state = bench.pair.exchange(command)?;
                 state.arms[0].angles[0] = f64::NAN;

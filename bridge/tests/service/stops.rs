@@ -52,6 +52,24 @@ async fn any_client_stops_the_arms() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn silent_arms_are_disconnected_and_confirm_no_stop() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    rig.tap.fail(Fault::Silent);
+    let unconfirmed = rig.client.stop(pb::StopRequest {}).await.unwrap_err();
+    assert_eq!(unconfirmed.code(), Code::Unavailable);
+    assert!(unconfirmed.message().contains("have not confirmed it"), "{unconfirmed}");
+    let status = rig.eventually(|status| status.arms.is_empty()).await;
+    assert!(!status.at_rest, "their motion is unknown");
+    let refused = rig.reset(&token).await.unwrap_err();
+    assert!(refused.message().contains("not connected: no new state for 1 s"), "{refused}");
+    rig.tap.fail(Fault::None);
+    rig.eventually(|status| !status.arms.is_empty()).await;
+    rig.client.stop(pb::StopRequest {}).await.unwrap();
+    rig.reset(&token).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_waits_in_no_queue() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;
