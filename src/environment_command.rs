@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process_group};
 use tandem_worker::{EnvironmentServer, ServerAddress, ServerNotStarted};
-use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::Mutex;
 
@@ -21,6 +21,8 @@ use crate::{program, runtime, signals};
 const LISTEN_VARIABLE: &str = "TANDEM_ENV_LISTEN";
 /// The beginning of the line with which the command reports its address.
 const LISTENING: &str = "listening on ";
+/// The longest line of the command's output that is read as one.
+const MAX_LINE_BYTES: u64 = 64 << 10;
 /// Time that a process group has to end after SIGTERM.
 const GRACE: Duration = Duration::from_secs(3);
 /// Time that the guard has to end the command.
@@ -159,10 +161,11 @@ async fn log_lines(mut output: BufReader<ChildStdout>) {
     }
 }
 
-/// Returns the next line, whose bytes need not be UTF-8; `None` if the output has ended.
+/// Returns the next line, whose bytes need not be UTF-8; `None` if the output has ended. A longer line than
+/// [`MAX_LINE_BYTES`] is divided.
 async fn next_line(output: &mut BufReader<ChildStdout>) -> Option<String> {
     let mut line = Vec::new();
-    match output.read_until(b'\n', &mut line).await {
+    match output.take(MAX_LINE_BYTES).read_until(b'\n', &mut line).await {
         Ok(0) | Err(_) => None,
         Ok(_) => Some(String::from_utf8_lossy(&line).trim_end().to_owned()),
     }

@@ -27,7 +27,7 @@ pub(crate) fn ledger(out: &Path) -> PathBuf {
 /// Returns the round of the newest checkpoint of the run in `out`, if there is one.
 pub(crate) fn saved_round(out: &Path) -> Option<u64> {
     let checkpoints = tandem_learner::checkpoint::list(&checkpoints(out));
-    checkpoints.last()?.file_stem()?.to_str()?.parse().ok()
+    tandem_learner::checkpoint::round_of(checkpoints.last()?)
 }
 
 /// Returns how far the run in `out` is: `complete`, `saved after round 6`, or `not saved yet`.

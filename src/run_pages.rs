@@ -31,6 +31,9 @@ impl RunPages {
         config: &RunConfig,
         out: &Path,
     ) -> Result<Option<Self>, Failed> {
+        if !metrics(out).exists() {
+            return Ok(None);
+        }
         let rows = read_rows(out)?;
         if rows.is_empty() { Ok(None) } else { Self::of_rows(config, out, &rows, &[]).map(Some) }
     }
@@ -48,8 +51,12 @@ impl RunPages {
     }
 }
 
+fn metrics(out: &Path) -> PathBuf {
+    out.join("metrics.jsonl")
+}
+
 fn read_rows(out: &Path) -> Result<Vec<MetricsRow>, Failed> {
-    MetricsLog::read_all(&out.join("metrics.jsonl")).or_exit(Exit::Data, String::new)
+    MetricsLog::read_all(&metrics(out)).or_exit(Exit::Data, String::new)
 }
 
 /// Draws the success rate over environment steps.

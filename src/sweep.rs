@@ -400,7 +400,7 @@ fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(),
         statuses.len(),
         out.display()
     ))?;
-    output::print(format_args!("compare them  tandem report {}", out.display()))
+    output::print(format_args!("compare them  tandem report {}", shell_word(out)))
 }
 
 /// Returns an error that names the failed runs, if there are any.

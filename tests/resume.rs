@@ -200,6 +200,7 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
         check_refused(&resume(&out, &["--set", setting]), 64, what);
     }
     check_refused(&resume(&out, &["--teacher", &other]), 64, "another policy");
+    check_refused(&resume(&out, &["--arms", "1"]), 64, "arms is 1 here and 2 in the run file");
     assert_eq!(saved_files(&out), before);
 
     let changed = keep.path().join("changed.toml");
@@ -217,6 +218,33 @@ fn a_resume_with_other_settings_is_refused_and_names_them() {
     assert_eq!(saved_files(&out), before);
 
     assert_eq!(digest(&resume(&out, &[])), UNDISTURBED.1, "the run can still be resumed");
+}
+
+#[test]
+fn a_lost_copy_of_the_teacher_is_replaced_by_the_same_teacher_only() {
+    let (keep, out) = finished();
+    let copy = out.join("policy/teacher.safetensors");
+    let kept = keep.path().join("kept.safetensors");
+    fs::rename(&copy, &kept).expect("moves");
+    let other = other_teacher(keep.path());
+    check_refused(&resume(&out, &["--teacher", &other]), 64, "another policy");
+    assert!(!copy.exists());
+    let given = kept.to_str().expect("UTF-8");
+    assert_eq!(digest(&resume(&out, &["--teacher", given])), UNDISTURBED.1);
+    fs::copy(&other, &copy).expect("writable");
+    check_refused(&resume(&out, &[]), 64, "another policy");
+}
+
+#[test]
+fn a_run_whose_ledger_loses_its_log_restarts_the_teacher() {
+    let (_keep, out) = directory();
+    let run = start(&out);
+    wait_for_checkpoint(&out);
+    fs::remove_file(out.join("ledger.sqlite-wal")).expect("the log of a ledger in use");
+    let ended = run.wait_with_output().expect("ends");
+    assert_eq!(digest(&ended), UNDISTURBED.1);
+    let log = fs::read_to_string(out.join("tandem.log")).expect("a log");
+    assert!(log.contains("the ledger was removed or replaced"), "{log}");
 }
 
 #[test]

@@ -151,7 +151,23 @@ fn prune(directory: &Path, newest: &Path, keep: usize) {
 /// Returns the checkpoints in `directory`, oldest first; none if it cannot be read.
 #[must_use]
 pub fn list(directory: &Path) -> Vec<PathBuf> {
-    files(directory, "safetensors").unwrap_or_default()
+    by_round(directory).unwrap_or_default()
+}
+
+/// Returns the round of a checkpoint; `None` if the file has no name of a checkpoint.
+#[must_use]
+pub fn round_of(path: &Path) -> Option<u64> {
+    let stem = path.file_stem()?.to_str()?;
+    stem.bytes().all(|byte| byte.is_ascii_digit()).then(|| stem.parse().ok())?
+}
+
+/// Returns the checkpoints in `directory`, oldest first. Files with other names, such as a user's copies, are none.
+fn by_round(directory: &Path) -> io::Result<Vec<PathBuf>> {
+    let files = files(directory, "safetensors")?.into_iter();
+    let mut checkpoints: Vec<(u64, PathBuf)> =
+        files.filter_map(|path| Some((round_of(&path)?, path))).collect();
+    checkpoints.sort();
+    Ok(checkpoints.into_iter().map(|(_, path)| path).collect())
 }
 
 /// Returns the files of `directory` with this extension, by name; a missing directory has none.
@@ -191,7 +207,7 @@ pub fn load_newest(
             source,
         })?;
     }
-    let mut paths = files(directory, "safetensors").map_err(unreadable)?;
+    let mut paths = by_round(directory).map_err(unreadable)?;
     let Some(newest) = paths.pop() else { return Ok(None) };
     load(&newest, config).map(Some).map_err(|error| match (error, paths.pop()) {
         (CheckpointError::Damaged { path, what }, Some(former)) => {

@@ -88,6 +88,9 @@ pub(crate) struct TeacherArgs {
         hide_env_values = true
     )]
     pub(crate) ledger: OsString,
+    /// Exits when the file of the ledger was removed or replaced, for a parent process that restarts the teacher.
+    #[arg(long, hide = true)]
+    pub(crate) exit_without_ledger: bool,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]

@@ -31,6 +31,13 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
     {
         run_file::keep_interval(&mut run_config, &existing);
     }
+    // With --out-is-locked the parent process has written the run file.
+    if args.resume && !args.out_is_locked && !args.out.join("run.toml").exists() {
+        let out = args.out.display();
+        return Err(run_directory::no_run(&format!(
+            "{out} holds no run to resume (--start-or-resume begins one)"
+        )));
+    }
     let start_from = args.start_from.as_deref().map(policy_file::load).transpose()?;
     let own = metrics::of_process("learner");
     let server_config =

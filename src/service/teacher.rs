@@ -26,7 +26,8 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
             let policy = source.open(&client_config).await.map_err(teacher_failed)?;
             check_digest(&policy, args.policy_digest.as_deref())?;
             let ledger = open_ledger(args.ledger).map_err(teacher_failed)?;
-            Advisor::new(policy, ledger).map_err(teacher_failed)
+            let advisor = Advisor::new(policy, ledger).map_err(teacher_failed)?;
+            Ok(if args.exit_without_ledger { advisor.ending_without_ledger() } else { advisor })
         };
         let advisor = tokio::select! {
             advisor = opened => advisor?,
@@ -112,7 +113,7 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         }
         E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
         E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
-        E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::LedgerLost | E::Transport(_) | E::Thread(_) => Exit::TryAgain,
         E::SurplusCritic => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,

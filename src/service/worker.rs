@@ -70,11 +70,9 @@ pub(crate) fn worker_failed(error: Error) -> Failed {
         E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } | E::NoServer => {
             Exit::Bug
         }
-        E::EnvironmentFailed { .. }
-        | E::Protocol { .. }
-        | E::Parameters { .. }
-        | E::LogDir { .. }
-        | E::Thread(_) => Exit::TryAgain,
+        E::EnvironmentFailed { .. } | E::Protocol { .. } | E::Parameters { .. } | E::Thread(_) => {
+            Exit::TryAgain
+        }
     };
     let error = anyhow::Error::from(error);
     match configuration_problem(&error) {

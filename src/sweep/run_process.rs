@@ -113,7 +113,12 @@ impl RunProcess {
         let mut args = self.args.clone();
         match run_status::state(&self.run, &self.dir)? {
             (State::Finished(summary), _) => return Ok(RunOutcome::Complete(summary)),
-            (State::Started, extends_to) => args.extend(resume_arguments(extends_to)),
+            (State::Started, extends_to) => {
+                args.extend(resume_arguments(extends_to));
+                if !run_status::has_teacher_copy(&self.run, &self.dir) {
+                    args.extend(self.teacher_arguments());
+                }
+            }
             (State::New, _) => args.extend(self.start_arguments()?),
         }
         drop(unused);
@@ -148,8 +153,12 @@ impl RunProcess {
     /// Writes the run file of a new run, and returns the arguments that start it.
     fn start_arguments(&self) -> anyhow::Result<Vec<OsString>> {
         let mut args = vec!["--run".into(), self.write_run_file()?.into()];
-        args.extend(self.run.teacher.iter().flat_map(|path| ["--teacher".into(), path.into()]));
+        args.extend(self.teacher_arguments());
         Ok(args)
+    }
+
+    fn teacher_arguments(&self) -> impl Iterator<Item = OsString> {
+        self.run.teacher.iter().flat_map(|path| ["--teacher".into(), path.into()])
     }
 
     /// Writes the resolved settings of a new run next to the run file of `tandem train`.

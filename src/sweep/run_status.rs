@@ -166,14 +166,20 @@ fn shortest(value: &Value) -> String {
 /// Returns whether the run's copy of its teacher equals the file that the sweep file names.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
-    let copy = match is_onnx(teacher) {
-        true => "policy/teacher.onnx",
-        false => "policy/teacher.safetensors",
-    };
-    let copy = regular_file::read(&dir.join(copy));
+    let copy = regular_file::read(&teacher_copy(teacher, dir));
     // The run itself reports a missing file.
     let named = regular_file::read(teacher);
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
+}
+
+/// Returns whether the run has a copy of its teacher, if it needs one that the sweep file names.
+pub(super) fn has_teacher_copy(run: &PlannedRun, dir: &Path) -> bool {
+    run.teacher.as_ref().is_none_or(|teacher| teacher_copy(teacher, dir).exists())
+}
+
+/// Returns the path of the run's copy of `teacher`.
+fn teacher_copy(teacher: &Path, dir: &Path) -> PathBuf {
+    dir.join("policy").join(if is_onnx(teacher) { "teacher.onnx" } else { "teacher.safetensors" })
 }
 
 fn has_learned(dir: &Path) -> bool {

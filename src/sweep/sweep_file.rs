@@ -144,6 +144,14 @@ fn runs(file: &SweepFile, of_server: &[(String, Value)]) -> anyhow::Result<Vec<P
     let mut runs = Vec::with_capacity(n_runs);
     for (seed, task) in pairs(&seeds, &tasks) {
         for (column, axis) in pairs(&columns, &axes) {
+            // Settings of [per_task.TASK], after the task itself, may be overridden.
+            let of_task = task.settings.get(..1).unwrap_or_default();
+            reject_set_twice([
+                ("tasks", of_task),
+                ("strategies and variants", &column.settings),
+                ("axes", &axis.settings),
+                ("seeds", &seed.settings),
+            ])?;
             let mut settings = base.clone();
             for choice in [task, column, axis, seed] {
                 settings.extend(choice.settings.iter().cloned());
@@ -213,6 +221,21 @@ fn reject_equal_names(runs: &[PlannedRun]) -> anyhow::Result<()> {
         Some(run) => bail!("two runs would be called {}: something is listed twice", run.name),
         None => Ok(()),
     }
+}
+
+/// Rejects settings that two lists of the file set, or one of them twice: runs would differ in their names only.
+fn reject_set_twice(lists: [(&str, &[(String, Value)]); 4]) -> anyhow::Result<()> {
+    let mut set_by = BTreeMap::new();
+    for (list, (key, _)) in
+        lists.iter().flat_map(|(list, all)| all.iter().map(move |one| (list, one)))
+    {
+        match set_by.insert(key, list) {
+            Some(other) if other == list => bail!("{key} is set twice by {list}"),
+            Some(other) => bail!("{key} is set by {other} and by {list}: expected one of them"),
+            None => {}
+        }
+    }
+    Ok(())
 }
 
 /// Rejects a teacher of a task that no run has. The tasks of runs have their full names.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use tandem_learner::{checkpoint, settings};
 use tandem_rl::RunConfig;
+use tandem_rl::config::Recipe;
 use tandem_worker::ServedTask;
 use toml::Value;
 
@@ -143,6 +144,9 @@ impl Plan {
 
     /// Rejects a teacher other than the run's own.
     fn check_teacher(&self) -> Result<(), Failed> {
+        if let Some(teacher) = &self.teacher {
+            teacher.check_recorded(&self.policies())?;
+        }
         let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
         // A missing or damaged copy is replaced.
         match TeacherFile::stored_in(&self.policies()) {
@@ -164,7 +168,8 @@ impl Plan {
         let directory = self.policies();
         std::fs::create_dir_all(&directory)
             .or_cannot_write(|| format!("cannot write {}", directory.display()))?;
-        teacher.copy_to(&directory)
+        teacher.copy_to(&directory)?;
+        teacher.record_digest(&directory)
     }
 
     /// Writes the server of the environments to the run directory, unless it is stored there.
@@ -238,6 +243,9 @@ fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Fa
         return Err(run_directory::no_run(&format!("{} holds no run to resume", out.display())));
     }
     let settings = [served_settings(args, served)?, settings_of(args)?].concat();
+    if let Some(own_file) = own_file.as_ref().filter(|_| args.run.is_none()) {
+        check_task(own_file, &settings)?;
+    }
     let mut config = run_file::resolve(args.run.as_deref().or(own_file.as_deref()), &settings)?;
     let is_named = settings.iter().any(|(key, _)| key == "name");
     // A resumed run keeps its name and its interval between evaluations, even if --run names another run file.
@@ -250,6 +258,28 @@ fn config(args: &TrainArgs, served: Option<&ServedTask>) -> Result<RunConfig, Fa
         }
     }
     Ok(config)
+}
+
+/// Rejects a resume for another task, number of arms or recipe, on which the values of other settings depend.
+fn check_task(own_file: &Path, settings: &[(String, Value)]) -> Result<(), Failed> {
+    let Ok(run) = run_file::resolve(Some(own_file), &[]) else { return Ok(()) };
+    let of_run = [
+        ("task", run.task.clone()),
+        ("arms", run.arms.to_string()),
+        ("recipe", recipe_name(run.recipe).to_owned()),
+    ];
+    for (key, of_run) in of_run {
+        let given = settings.iter().rev().find(|(name, _)| name == key).map(|(_, value)| value);
+        let given =
+            given.map(|value| value.as_str().map_or_else(|| value.to_string(), str::to_owned));
+        if let Some(given) = given.filter(|given| *given != of_run) {
+            return Err(Failed::usage(format!(
+                "{key} is {given} here and {of_run} in the run file {own_file:?}: {}",
+                settings::ADVICE
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// Returns the settings that describe the task of a server, unless the task is built-in or the command line names a task
@@ -283,8 +313,8 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     let integer =
         |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
     let recipe = args.recipe.map(|recipe| match recipe {
-        RecipeName::Tandem => "tandem",
-        RecipeName::Paper => "paper",
+        RecipeName::Tandem => recipe_name(Recipe::Tandem),
+        RecipeName::Paper => recipe_name(Recipe::Paper),
     });
     let flags = [
         ("task", task.map(|task| Value::String(task.name().to_owned()))),
@@ -299,6 +329,13 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     ];
     settings.extend(flags.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
     Ok(settings)
+}
+
+const fn recipe_name(recipe: Recipe) -> &'static str {
+    match recipe {
+        Recipe::Tandem => "tandem",
+        Recipe::Paper => "paper",
+    }
 }
 
 /// Returns one worker per core, at most one per slot.

@@ -155,7 +155,12 @@ impl RunProcesses {
             if let State::Running(child) = &mut process.state
                 && let Some(end) = child.try_wait()?
             {
-                process.handle_end(end, self.launcher.log(), &mut events)?;
+                match process.handle_end(end, self.launcher.log(), &mut events) {
+                    Err(_) if !lock.is_in_place() => {
+                        return Err(displaced(plan, &process.name, end));
+                    }
+                    handled => handled?,
+                }
             }
             if let State::Waiting { until, end, reason } = &process.state
                 && *until <= clock::now()

@@ -173,8 +173,9 @@ fn next_commands(plan: &Plan) -> Vec<String> {
     if plan.config.stop.max_env_steps > 0 {
         let longer = 2 * plan.config.stop.max_env_steps;
         let minutes = if plan.config.stop.max_minutes > 0.0 { " --max-minutes 0" } else { "" };
-        commands
-            .push(format!("tandem train --resume --out {out} --max-env-steps {longer}{minutes}"));
+        let success = if plan.config.stop.until_success > 0.0 { " --until-success 0" } else { "" };
+        let limits = format!("--max-env-steps {longer}{minutes}{success}");
+        commands.push(format!("tandem train --resume --out {out} {limits}"));
     }
     commands
 }

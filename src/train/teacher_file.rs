@@ -20,6 +20,8 @@ const POLICY_COPY: &str = "teacher.safetensors";
 const ACTOR_COPY: &str = "teacher.onnx";
 const CRITIC_COPY: &str = "teacher-critic.onnx";
 const SERVER_COPY: &str = "teacher.toml";
+/// File with the digest of the run's teacher, by which a resumed run recognizes it.
+const DIGEST: &str = "teacher.digest";
 
 /// The policy of the teacher, as read from its files or described by its server.
 pub(crate) struct TeacherFile {
@@ -108,6 +110,27 @@ impl TeacherFile {
         }
         let Self { path, digest, .. } = Self::copy_in(directory)?.ok()?;
         Some(StoredTeacher { path, digest, server: None })
+    }
+
+    /// Writes the digest to `directory`, with the copy of a new run's teacher.
+    pub(super) fn record_digest(&self, directory: &Path) -> Result<(), Failed> {
+        let path = directory.join(DIGEST);
+        let written = atomic_file::replace(&path, format!("{}\n", self.digest).as_bytes());
+        written.or_cannot_write(|| format!("cannot write {}", path.display()))
+    }
+
+    /// Rejects a teacher with another digest than `directory` records. Runs of earlier versions record none.
+    pub(super) fn check_recorded(&self, directory: &Path) -> Result<(), Failed> {
+        let recorded = std::fs::read_to_string(directory.join(DIGEST)).unwrap_or_default();
+        let recorded = recorded.trim();
+        if recorded.is_empty() || recorded == self.digest {
+            return Ok(());
+        }
+        Err(Failed::usage(format!(
+            "{} is another policy than the run's teacher, whose digest is {recorded}: name that one with --teacher FILE, \
+             or start a new run",
+            self.path.display()
+        )))
     }
 
     /// Returns whether `stored` is a copy of this teacher.

@@ -28,6 +28,8 @@ pub struct Advisor {
     strategies: BTreeMap<String, Strategy>,
     /// Accounts for which a step was asked about again with other numbers, so that each gets one warning.
     reused: BTreeSet<String>,
+    /// Whether the service ends when the ledger is lost.
+    ends_without_ledger: bool,
 }
 
 /// A description of the teacher.
@@ -82,7 +84,26 @@ impl Advisor {
             layout,
         };
         let inference = TeacherInference::new(policy);
-        Ok(Self { info, inference, ledger, strategies: BTreeMap::new(), reused: BTreeSet::new() })
+        Ok(Self {
+            info,
+            inference,
+            ledger,
+            strategies: BTreeMap::new(),
+            reused: BTreeSet::new(),
+            ends_without_ledger: false,
+        })
+    }
+
+    /// Makes the service end with [`Error::LedgerLost`] when the ledger's storage was removed or replaced. Otherwise it
+    /// continues to refuse charges.
+    #[must_use]
+    pub fn ending_without_ledger(self) -> Self {
+        Self { ends_without_ledger: true, ..self }
+    }
+
+    /// Returns whether the service must end, because the ledger is lost.
+    pub(crate) fn must_end(&self) -> bool {
+        self.ends_without_ledger && self.ledger.is_lost()
     }
 
     /// Returns the description of the teacher.

@@ -55,6 +55,9 @@ pub enum Error {
     /// The ledger cannot be opened.
     #[error(transparent)]
     OpenLedger(#[from] OpenError),
+    /// The storage of the ledger was removed or replaced, and the service ends.
+    #[error("the ledger was removed or replaced")]
+    LedgerLost,
     /// The teacher's networks returned infinity or NaN.
     #[error(
         "the teacher's networks returned a number that is not finite for step {step} of episode {episode}"

@@ -106,6 +106,11 @@ pub trait Ledger: Send {
     fn warning(&self) -> Option<&str> {
         None
     }
+
+    /// Returns whether the storage was removed or replaced, so that no later attempt to write can succeed.
+    fn is_lost(&self) -> bool {
+        false
+    }
 }
 
 /// The reason why a ledger cannot be opened.

@@ -1,7 +1,5 @@
 //! Errors of a worker.
 
-use std::path::PathBuf;
-
 use tandem_core::task::TaskDifference;
 use tandem_net::Operation;
 use tandem_proto::DecodeError;
@@ -20,14 +18,6 @@ pub enum Error {
         role: &'static str,
         /// The cause.
         source: tandem_net::ClientConfigError,
-    },
-    /// The directory for logs cannot be created.
-    #[error("cannot create the log directory {path:?}")]
-    LogDir {
-        /// The configured path.
-        path: PathBuf,
-        /// The cause.
-        source: std::io::Error,
     },
     /// A peer rejected a call, or its response cannot be used.
     #[error("cannot {attempted}")]

@@ -128,6 +128,8 @@ impl LogWriter {
 
     fn write(&mut self, recording: &Recording, path: &Path) -> Result<(), RecordError> {
         let Recording { metadata, episode, trace } = recording;
+        // The directory may have been deleted to make room. If it cannot be created, the log cannot either.
+        drop(std::fs::create_dir_all(&self.directory));
         let written = match trace {
             Some(trace) => record_traced(metadata, episode, trace, path),
             None => record_episode(metadata, episode, path),
@@ -255,11 +257,12 @@ mod tests {
     #[test]
     fn a_log_that_cannot_be_written_pauses_recording() {
         let directory = tempfile::tempdir().expect("a directory");
-        let missing = directory.path().join("mcap");
-        let (mut writer, recording) = (writer(&missing), traced(&[3]).remove(0));
+        let logs = directory.path().join("mcap");
+        std::fs::write(&logs, "a file in the way").expect("writable");
+        let (mut writer, recording) = (writer(&logs), traced(&[3]).remove(0));
         writer.record(&recording);
         assert!(writer.is_paused && writer.n_to_skip == PAUSE_EPISODES);
-        std::fs::create_dir(&missing).expect("a directory");
+        std::fs::remove_file(&logs).expect("there is one");
         let (queue, recordings) = sync_channel(usize::try_from(PAUSE_EPISODES).expect("few") + 1);
         for _ in 0..=PAUSE_EPISODES {
             let Recording { metadata, episode, .. } = &recording;
@@ -269,6 +272,6 @@ mod tests {
         }
         drop(queue);
         writer.run(&recordings);
-        assert_eq!(std::fs::read_dir(&missing).expect("readable").count(), 1, "recorded again");
+        assert_eq!(std::fs::read_dir(&logs).expect("readable").count(), 1, "recorded again");
     }
 }

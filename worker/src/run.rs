@@ -77,8 +77,6 @@ pub async fn run_with(
 
 /// Starts the thread that writes logs.
 fn start_recorder(config: RecordingConfig, threads: &TaskTracker) -> Result<Recorder, Error> {
-    let path = &config.directory;
-    std::fs::create_dir_all(path).map_err(|source| Error::LogDir { path: path.clone(), source })?;
     Recorder::start(config, threads.token()).map_err(Error::Thread)
 }
 

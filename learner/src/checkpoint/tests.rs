@@ -182,6 +182,19 @@ fn the_newest_checkpoints_stay_including_the_one_just_written() {
 }
 
 #[test]
+fn a_file_with_another_name_is_no_checkpoint() {
+    let (directory, mut trainer) = saved(2);
+    let copy = directory.path().join("keep-1.safetensors");
+    fs::copy(directory.path().join("00000001.safetensors"), &copy).expect("copies");
+    assert_eq!(restored(&directory).path, directory.path().join("00000002.safetensors"));
+    train_round(&mut trainer);
+    save(directory.path(), &trainer, &resumption(&trainer), 2).expect("saves");
+    let rounds: Vec<_> = list(directory.path()).iter().map(|path| round_of(path)).collect();
+    assert_eq!(rounds, [Some(2), Some(3)]);
+    assert!(copy.exists(), "the user's file stays and does not count");
+}
+
+#[test]
 fn a_missing_checkpoint_is_no_error() {
     let directory = tempfile::tempdir().expect("a directory");
     let load = || load_newest(&directory.path().join("checkpoint"), &small_config());

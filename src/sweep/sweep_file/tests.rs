@@ -187,3 +187,25 @@ fn a_contradictory_server_is_refused() {
     check("env = \"a:1\"\nenv_timeout_s = 0.0", seconds);
     check("env = \"a:1\"\nenv_timeout_s = -1.0", seconds);
 }
+
+#[test]
+fn a_setting_that_two_lists_set_is_refused() {
+    let axis = |key: &str| format!("[[axis]]\n\"{key}\" = [1, 2]\n");
+    let variant = "[[variant]]\nname = \"a\"\nset = { seed = 7, advice.strategy = \"none\" }\n";
+    let check = |text: String, expected: &str| {
+        let error = runs_of(&format!("{text}{LIMIT}")).expect_err("refused").to_string();
+        assert!(error.starts_with(expected), "{error}");
+    };
+    check(format!("seeds = [1]\n{}", axis("seed")), "seed is set by axes and by seeds");
+    check(format!("seeds = [1]\n{variant}"), "seed is set by strategies and variants and by seeds");
+    let strategy = "[[axis]]\nadvice.strategy = [\"ea\"]\n";
+    check(
+        format!("{variant}{strategy}"),
+        "advice.strategy is set by strategies and variants and by axes",
+    );
+    check(axis("rounds.lag") + &axis("rounds.lag"), "rounds.lag is set twice by axes");
+    check(
+        ("tasks = [\"push\"]\n[[axis]]\ntask = [\"push\"]\n").to_owned(),
+        "task is set by tasks and by axes",
+    );
+}

@@ -198,6 +198,10 @@ impl Ledger for SqliteLedger {
     fn warning(&self) -> Option<&str> {
         self.warning.as_deref()
     }
+
+    fn is_lost(&self) -> bool {
+        self.file.is_displaced()
+    }
 }
 
 #[cfg(test)]

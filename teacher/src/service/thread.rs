@@ -37,8 +37,8 @@ pub(super) struct AdvisorThread {
 
 /// The handle of the thread, or of the task under [`Pacing::Lockstep`].
 enum JoinHandle {
-    Thread(thread::JoinHandle<()>),
-    Task(tokio::task::JoinHandle<()>),
+    Thread(thread::JoinHandle<Result<(), Error>>),
+    Task(tokio::task::JoinHandle<Result<(), Error>>),
 }
 
 /// Sends jobs to the thread, which ends when all handles are dropped.
@@ -71,17 +71,17 @@ impl AdvisorThread {
         let batch = Batch::new(metrics.clone());
         let (end_sender, ended) = oneshot::channel();
         let info = Arc::new(advisor.info().clone());
-        let end_signal = EndSignal { _stop: stop.drop_guard(), _ended: end_sender };
+        let end_signal = EndSignal { _stop: stop.clone().drop_guard(), _ended: end_sender };
         let handle = match pacing {
             Pacing::Concurrent => JoinHandle::Thread(
                 thread::Builder::new().name("advisor".to_owned()).spawn(move || {
                     let _end_signal = end_signal;
-                    run_thread(advisor, queue, batch);
+                    run_thread(advisor, queue, batch, &stop)
                 })?,
             ),
             Pacing::Lockstep => JoinHandle::Task(tokio::spawn(async move {
                 let _end_signal = end_signal;
-                run_task(advisor, queue, batch).await;
+                run_task(advisor, queue, batch, &stop).await
             })),
         };
         Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout, metrics }))
@@ -90,12 +90,12 @@ impl AdvisorThread {
     /// Waits up to `grace` for the end of the thread. A thread that is still busy then is detached.
     ///
     /// # Errors
-    /// When the thread has panicked.
+    /// When the thread has panicked, or ended because the ledger is lost.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
             Ok(_ended) => match self.handle {
-                JoinHandle::Thread(thread) => thread.join().map_err(|_panic| Error::Panicked),
-                JoinHandle::Task(task) => task.await.map_err(|_panic| Error::Panicked),
+                JoinHandle::Thread(thread) => thread.join().map_err(|_panic| Error::Panicked)?,
+                JoinHandle::Task(task) => task.await.map_err(|_panic| Error::Panicked)?,
             },
             Err(_elapsed) => {
                 tracing::warn!("the ledger is still in use after the grace period");
@@ -160,19 +160,39 @@ fn add_queue_depth(metrics: &TeacherMetrics, jobs: &mpsc::Sender<Job>) {
 }
 
 /// Executes jobs in their order. Requests that wait together are answered in one batch.
-fn run_thread(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>, mut batch: Batch) {
+fn run_thread(
+    mut advisor: Advisor,
+    mut jobs: mpsc::Receiver<Job>,
+    mut batch: Batch,
+    stop: &CancellationToken,
+) -> Result<(), Error> {
     while let Some(job) = jobs.blocking_recv() {
         batch.take_all(job, &mut jobs, &mut advisor);
         batch.answer(&mut advisor);
+        if advisor.must_end() {
+            // The service ends; until then, calls are refused.
+            stop.cancel();
+        }
     }
+    if advisor.must_end() { Err(Error::LedgerLost) } else { Ok(()) }
 }
 
 /// As [`run_thread`], on the runtime of the calls: requests of one simulated moment are answered in one batch.
-async fn run_task(mut advisor: Advisor, mut jobs: mpsc::Receiver<Job>, mut batch: Batch) {
+async fn run_task(
+    mut advisor: Advisor,
+    mut jobs: mpsc::Receiver<Job>,
+    mut batch: Batch,
+    stop: &CancellationToken,
+) -> Result<(), Error> {
     while let Some(job) = jobs.recv().await {
         batch.take_all(job, &mut jobs, &mut advisor);
         batch.answer(&mut advisor);
+        if advisor.must_end() {
+            // The service ends; until then, calls are refused.
+            stop.cancel();
+        }
     }
+    if advisor.must_end() { Err(Error::LedgerLost) } else { Ok(()) }
 }
 
 /// Requests that are answered together.

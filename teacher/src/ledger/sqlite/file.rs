@@ -76,6 +76,11 @@ impl LedgerFile {
         &self.path
     }
 
+    /// Returns whether the file was displaced.
+    pub(super) const fn is_displaced(&self) -> bool {
+        self.displaced.is_some()
+    }
+
     /// Adds an account with an unspent budget, and returns its key.
     pub(super) fn add_account(
         &mut self,
