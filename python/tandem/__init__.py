@@ -3,8 +3,8 @@
 Importing the package registers nine environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
 `tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`, and the same tasks in the shared world as
 `tandem/SharedPush-v0` and so on; in `tandem/CarryBar-v0` two arms carry a bar. With `pip install 'tandem-rl[fetch]'`
-there are two more, in MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers and clients need
-gRPC: `pip install 'tandem-rl[grpc]'`.
+there are two more, in MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers, clients
+and `ServedEnv` need gRPC: `pip install 'tandem-rl[grpc]'`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -15,11 +15,13 @@ from tandem.vector import TandemVectorEnv
 
 if TYPE_CHECKING:
     from tandem._environments import EnvironmentServer as EnvironmentServer
+    from tandem._environments import episode_seed as episode_seed
     from tandem._environments import serve as serve
     from tandem._fetch import FETCH_REFLECTION as FETCH_REFLECTION
     from tandem._grpc import ServiceError as ServiceError
     from tandem._policies import PolicyServer as PolicyServer
     from tandem._policies import serve_policy as serve_policy
+    from tandem._served import ServedEnv as ServedEnv
     from tandem._task import Arm as Arm
     from tandem._task import ArmManipulation as ArmManipulation
     from tandem._task import Condition as Condition
@@ -39,10 +41,11 @@ __all__ = ["Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_pol
 register_envs()
 
 _SERVICES = {
-    "_environments": ("EnvironmentServer", "serve"),
+    "_environments": ("EnvironmentServer", "episode_seed", "serve"),
     "_fetch": ("FETCH_REFLECTION",),
     "_grpc": ("ServiceError",),
     "_policies": ("PolicyServer", "serve_policy"),
+    "_served": ("ServedEnv",),
     "_task": ("Arm", "ArmManipulation", "Condition", "Manipulation", "Reflection", "Task"),
     "clients": ("Bridge", "CallError", "Learner", "MotionStopped", "Step", "Teacher", "WayPoint"),
 }

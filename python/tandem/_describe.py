@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -49,6 +50,17 @@ class TaskOptions:
         if unknown:
             raise ServiceError(f"the environment's tandem_task has unknown items: {', '.join(sorted(unknown))}")
         return cls(**{**own, **{name: value for name, value in given.items() if value is not None}})
+
+
+@contextlib.contextmanager
+def environment_errors() -> Iterator[None]:
+    """Converts the errors of an environment that cannot be used to `ServiceError`."""
+    try:
+        yield
+    except ServiceError:
+        raise
+    except (Exception, SystemExit) as error:  # Environments raise errors of their own.
+        raise ServiceError(f"the environment cannot be used: {type(error).__name__}: {error}") from error
 
 
 def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, bool]:
@@ -105,7 +117,25 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         reflection=options.reflection,
     )
     _check_arms(task)
+    task.check()
     return task, found is None
+
+
+def appends_goal(env: gymnasium.Env[Any, Any], task: Task) -> bool:
+    """Returns whether the achieved goal has to be appended to the observations of `env`, given the task's description.
+
+    Raises:
+        ServiceError: The environment cannot be served, or not with the vectors of `task`.
+    """
+    spaces, action = _checked_spaces(env)
+    n_own, n_goal = (int(spaces[key].shape[0]) for key in ("observation", "achieved_goal"))
+    appends = n_own < task.n_observation and tuple(task.achieved_goal) == tuple(range(n_own, n_own + n_goal))
+    found = (n_own + n_goal if appends else n_own, n_goal, int(action.shape[0]))
+    expected = (task.n_observation, task.n_goal, task.n_action)
+    for name, length, its in zip(("observation", "goal", "action"), found, expected):
+        if length != its:
+            raise ServiceError(f"the environment is not that of task {task.name!r}: {name} of length {length}, not {its}")
+    return appends
 
 
 def _checked_spaces(env: gymnasium.Env[Any, Any]) -> tuple[Any, gymnasium.spaces.Box]:

@@ -16,23 +16,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tandem._describe import TaskOptions, describe
+from tandem._describe import TaskOptions, describe, environment_errors
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
-from tandem._gym import EnvFn, GymEnvironment, InvalidEpisode, make
+from tandem._gym import EnvFn, GymEnvironment, InvalidEpisode, contact_bits, first_outside, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
 from tandem._task import Arm, Floats, Manipulation, Norm, Reflection, Task
 
 LISTEN_VARIABLE = "TANDEM_ENV_LISTEN"
 """The environment variable with the address on which a worker wants its server to listen."""
 _FLOAT = np.dtype("<f4")
-ACTION_SLACK = 1e-6
-"""The distance by which rounding may move an action out of [-1, 1]."""
 _GRACE_S = 5.0
 """Time in which a process of environments must end once its stream has ended."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Returns the seed of `env.reset` for an episode of a run: 32 bits, from 0.
+    """Returns the seed with which a server resets an environment for an episode of a run: 32 bits, from 0.
+
+    `env.reset(seed=tandem.episode_seed(777, k))` starts test goal `k` of a run in an environment of one's own.
 
     It is the little-endian number in the first four bytes of SHA-256 of seed and episode, each as eight little-endian
     bytes.
@@ -55,15 +55,21 @@ class _Environments:
             with _named(index):
                 if index not in self._environments:
                     self._environments[index] = self._create()
-                answers.append(self._environments[index].reset(seed))
+                observation, goal, _ = self._environments[index].reset(seed)
+                answers.append((observation, goal))
         return answers
 
     def step(self, actions: Sequence[tuple[int, Floats]]) -> list[tuple[Floats, int]]:
-        """Executes actions, given with the indices of their environments."""
+        """Executes actions, given with the indices of their environments.
+
+        Returns:
+            For each, the observation and the contacts of the step as the bits of the protocol.
+        """
         answers = []
         for index, action in actions:
             with _named(index):
-                answers.append(self._environments[index].step(action))
+                observation, _, info = self._environments[index].step(action)
+                answers.append((observation, contact_bits(info)))
         return answers
 
     def close(self) -> None:
@@ -249,11 +255,9 @@ def decode_floats(field: str, data: bytes, n_rows: int, n_columns: int) -> Float
 
 def check_actions(field: str, actions: Floats) -> None:
     """Refuses actions with a number outside [-1, 1], or one that is not a number."""
-    flat = actions.ravel()
-    within = np.abs(flat) <= 1 + ACTION_SLACK
-    if not within.all():
-        index = int(np.argmin(within))
-        raise _invalid(f"{field}[{index}]: expected a number in [-1, 1], got {flat[index]:g}")
+    index = first_outside(actions)
+    if index is not None:
+        raise _invalid(f"{field}[{index}]: expected a number in [-1, 1], got {actions.ravel()[index]:g}")
 
 
 class _Servicer(environment_pb2_grpc.EnvironmentServicer):
@@ -369,14 +373,8 @@ class EnvironmentServer(Server):
             "episode_steps": episode_steps,
             "bound": bound,
         }
-        try:
-            with contextlib.closing(make(env_fn)) as env:
-                self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
-        except ServiceError:
-            raise
-        except (Exception, SystemExit) as error:  # Environments raise errors of their own.
-            raise ServiceError(f"the environment cannot be used: {type(error).__name__}: {error}") from error
-        self.task.check()
+        with environment_errors(), contextlib.closing(make(env_fn)) as env:
+            self.task, appends_goal = describe(env, TaskOptions.combined(env, given))
         task = self.task
 
         def create() -> GymEnvironment:

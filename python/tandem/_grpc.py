@@ -19,7 +19,7 @@ os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # Failures are raised; the libr
 try:
     import grpc as grpc
 except ImportError as error:
-    raise ImportError("servers and clients of tandem need gRPC: pip install 'tandem-rl[grpc]'") from error
+    raise ImportError("servers, clients and ServedEnv of tandem need gRPC: pip install 'tandem-rl[grpc]'") from error
 
 Path = str | os.PathLike[str]
 
@@ -50,7 +50,10 @@ _SERVING = b"\x08\x01"
 
 
 class ServiceError(Exception):
-    """A server that cannot start, or a peer that refuses a call. The message says what to do."""
+    """A server that cannot start, an environment that cannot be served, or a peer that refuses a call.
+
+    The message says what to do.
+    """
 
 
 class Refused(Exception):

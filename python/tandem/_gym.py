@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
@@ -45,12 +45,23 @@ def _make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
         raise ServiceError(f"cannot create environment {name!r}: {error}") from error
 
 
-class InvalidEpisode(Exception):
+ACTION_SLACK = 1e-6
+"""The distance by which rounding may move an action out of [-1, 1]."""
+
+
+def first_outside(actions: Floats) -> int | None:
+    """Returns the index of the first number of actions that is not in [-1, 1], in row-major order."""
+    # Written so that NaN fails the comparison.
+    within = np.abs(actions.ravel()) <= 1 + ACTION_SLACK
+    return None if within.all() else int(np.argmin(within))
+
+
+class InvalidEpisode(ServiceError):
     """An environment breaks a rule of episodes. Playing the same episode again would give the same result."""
 
 
 class GymEnvironment:
-    """A Gymnasium environment with the vectors of its task."""
+    """A Gymnasium environment with the vectors of its task, for servers and `tandem.ServedEnv`."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], task: Task, appends_goal: bool) -> None:
         self._env = env
@@ -66,29 +77,33 @@ class GymEnvironment:
         self._n_steps = 0
         self._goal = np.zeros(0, np.float32)
 
-    def reset(self, seed: int) -> tuple[Floats, Floats]:
-        """Starts an episode. Returns the observation, shape `[n_observation]`, and the goal, shape `[n_goal]`."""
-        observation, _ = self._env.reset(seed=seed)
+    def reset(self, seed: int | None, **options: Any) -> tuple[Floats, Floats, dict[str, Any]]:
+        """Starts an episode.
+
+        Returns:
+            The observation, shape `[n_observation]`, the goal, shape `[n_goal]`, and the environment's info.
+        """
+        observation, info = self._env.reset(seed=seed, **options)
         self._n_steps = 0
         # A copy: the environment may change its own array in place.
         goal = np.array(observation["desired_goal"], np.float32)
         _check_numbers("desired_goal", goal, self._goal_bounds)
         self._goal = goal
-        return self._vector(observation), goal
+        return self._vector(observation), goal, info
 
-    def step(self, action: Floats) -> tuple[Floats, int]:
+    def step(self, action: Floats) -> tuple[Floats, SupportsFloat, dict[str, Any]]:
         """Executes an action in [-1, 1], shape `[n_action]`.
 
         Returns:
-            The observation, shape `[n_observation]`, and the contacts of the step as the bits of the protocol.
+            The observation, shape `[n_observation]`, and the environment's reward and info.
         """
-        observation, _, terminated, _, info = self._env.step(self._own_action(action))
+        observation, reward, terminated, _, info = self._env.step(self._own_action(action))
         self._n_steps += 1
         if not np.array_equal(np.asarray(observation["desired_goal"], np.float32), self._goal):
             raise InvalidEpisode(f"desired_goal changed at step {self._n_steps}: an episode has one goal")
         if terminated and self._n_steps < self._task.episode_steps:
             self._check_termination(observation)
-        return self._vector(observation), contact_bits(info)
+        return self._vector(observation), reward, info
 
     def close(self) -> None:
         """Closes the environment."""

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tandem._environments import ACTION_SLACK, check_actions, decode_floats, run
+from tandem._environments import check_actions, decode_floats, run
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
+from tandem._gym import ACTION_SLACK
 from tandem._proto import policy_pb2, policy_pb2_grpc
 from tandem._task import Floats, Task
 from tandem.policy import Policy
@@ -206,7 +207,7 @@ class PolicyServer(Server):
         if isinstance(policy, Policy):
             if policy.n_arms != 1:
                 raise ServiceError(f"a teacher's policy drives 1 arm, this one drives {policy.n_arms}")
-            task, digest, batched = task or policy.task, digest or policy.digest, True
+            task, digest, batched = task or Task.of_policy(policy), digest or policy.digest, True
             policy, value = _functions(policy)
         if task is None:
             raise ServiceError("give the task of the policy: the name of a built-in one, such as shared-push, or a Task")
@@ -241,9 +242,9 @@ def serve_policy(
     Prints `listening on http://HOST:PORT` once it serves.
 
     Arguments:
-      policy: a one-arm policy of `tandem.load_policy`, which needs no other argument if its task is a built-in one; or
-        a function of observations, shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in
-        [-1, 1], shape `[m, n_action]`; all float32.
+      policy: a one-arm policy of `tandem.load_policy`, which needs no other argument; or a function of observations,
+        shape `[m, n_observation]`, and goals, shape `[m, n_goal]`, that returns actions in [-1, 1], shape
+        `[m, n_action]`; all float32.
       task: the name of a built-in task, such as `shared-push`, or a `tandem.Task` of one arm.
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
         without it, strategies that compare values are not available.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from tandem import _native
 from tandem._grpc import ServiceError
 from tandem._proto import task_pb2
+
+if TYPE_CHECKING:
+    from tandem.policy import Policy
 
 Floats = NDArray[np.float32]
 Norm = Literal["euclidean", "maximum"]
@@ -43,6 +46,12 @@ class Condition:
     """The largest distance."""
     target: Sequence[float] = ()
     """One value for each index; empty means zeros."""
+
+    def holds(self, norm: Norm, observation: Floats) -> bool:
+        """Returns whether `observation`, shape `[n_observation]`, satisfies the condition."""
+        numbers = observation[list(self.numbers)]
+        target = self.target if len(self.target) else np.zeros_like(numbers)
+        return distance(norm, numbers, np.asarray(target)) <= self.tolerance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,9 +212,20 @@ class Task:
             ServiceError: If there is no such task.
         """
         try:
-            described = _frozen(json.loads(_native.task_description(name, n_arms)))
+            return cls._from_json(_native.task_description(name, n_arms))
         except ValueError as error:
             raise ServiceError(f"{error}, or a Task") from error
+
+    @classmethod
+    def of_policy(cls, policy: Policy) -> Task:
+        """Returns the task of a policy, which its file describes unless it is a built-in one."""
+        if policy._description is None:
+            return cls.built_in(policy.task, policy.n_arms)
+        return cls._from_json(policy._description)
+
+    @classmethod
+    def _from_json(cls, description: str) -> Task:
+        described = _frozen(json.loads(description))
         arms = tuple(Arm(**arm) for arm in described.pop("arms"))
         reflection = Reflection(**described.pop("reflection", {}))
         manipulation = described.pop("manipulation", {})
@@ -220,6 +240,23 @@ class Task:
         return cls(
             **described, arms=arms, reflection=reflection, manipulation=Manipulation(**manipulation, arms=acting)
         )
+
+    def is_success(self, observation: Floats, goal: Floats) -> bool:
+        """Returns whether each arm's part of the goal, the part common to all arms and all conditions are achieved.
+
+        An episode is a success if this holds after each of its last `manipulation.success_steps` steps.
+
+        Args:
+            observation: Shape `[n_observation]`.
+            goal: Shape `[n_goal]`.
+        """
+        achieved = observation[list(self.achieved_goal)]
+        parts = [list(arm.goal) for arm in self.arms]
+        parts.append(sorted(set(range(self.n_goal)).difference(*parts)))
+        if any(distance(self.norm, achieved[part], goal[part]) > self.tolerance for part in parts if part):
+            return False
+        conditions = [c for arm in self.manipulation.arms for c in (*arm.holding, *arm.conditions)]
+        return all(condition.holds(self.norm, observation) for condition in conditions)
 
     def check(self) -> None:
         """Checks every field as the services that receive the description do.

@@ -230,7 +230,9 @@ def checked_number(name: str, number: SupportsIndex) -> int:
 def check_rendering(render_mode: str | None, width: int, height: int) -> None:
     """Raises a `ValueError` for a mode or a size of pictures that does not exist."""
     if render_mode not in (None, "rgb_array"):
-        raise ValueError(f'unknown render mode {render_mode!r}: expected "rgb_array" or None')
+        window = 'gymnasium.make shows "human" in a window (needs pygame)'
+        video = 'gymnasium.wrappers.RecordVideo records "rgb_array" (needs moviepy)'
+        raise ValueError(f'unknown render mode {render_mode!r}: expected "rgb_array" or None; {window}, {video}')
     if not (1 <= width <= 4096 and 1 <= height <= 4096):
         raise ValueError(f"pictures of {width} x {height} pixels: expected 1 to 4096 each")
 

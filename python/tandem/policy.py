@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -46,10 +47,11 @@ class Policy:
         Raises:
             ValueError: The task is not of this package's simulator.
         """
-        for env_id, (task, n_arms, world) in TASKS.items():
-            if (f"shared-{task}" if world == "shared" else task, n_arms) == (self.task, self.n_arms):
-                return env_id
-        raise ValueError(f"task {self.task!r} is not of this package's simulator: create its environment by its own id")
+        env_id = self._built_in_env_id()
+        if env_id is None:
+            own = "create its environment by its own id and wrap it in tandem.ServedEnv"
+            raise ValueError(f"task {self.task!r} is not of this package's simulator: {own}")
+        return env_id
 
     @property
     def has_critic(self) -> bool:
@@ -124,7 +126,26 @@ class Policy:
 
     def _inputs(self, observation: Mapping[str, ArrayLike]) -> tuple[_Floats, _Floats, bool]:
         is_batch = np.ndim(observation["observation"]) > 1
-        return _rows(observation["observation"]), _rows(observation["desired_goal"]), is_batch
+        observations = _rows(observation["observation"])
+        expected = (len(observations), self._native.n_observation)
+        if observations.shape != expected and self._built_in_env_id() is None:
+            served = f"tandem.ServedEnv gives an environment the vectors that {self.task!r} had on its server"
+            raise ValueError(f"observations have shape {observations.shape}, expected {expected}: {served}")
+        return observations, _rows(observation["desired_goal"]), is_batch
+
+    def _built_in_env_id(self) -> str | None:
+        for env_id, (task, n_arms, world) in TASKS.items():
+            if (f"shared-{task}" if world == "shared" else task, n_arms) == (self.task, self.n_arms):
+                return env_id
+        return None
+
+    @property
+    def _description(self) -> str | None:
+        """The description of a task that is not built-in, as JSON."""
+        file = self._native.to_bytes()
+        length = int.from_bytes(file[:8], "little")
+        description: str | None = json.loads(file[8 : 8 + length])["__metadata__"].get("description")
+        return description
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_native": self._native.to_bytes()}

@@ -163,7 +163,7 @@ def test_wrong_arguments_name_what_is_wrong():
         ({"n_arms": -1}, "n_arms is -1"),
         ({"substeps": 7}, "substeps"),
         ({"grasped_start_prob": 2.0}, "grasped_start_prob"),
-        ({"render_mode": "human"}, "render mode"),
+        ({"render_mode": "human"}, "render mode 'human': .* in a window .*needs pygame.*RecordVideo .*needs moviepy"),
         ({"width": 0}, "pixels"),
     ]:
         with pytest.raises(ValueError, match=message):
