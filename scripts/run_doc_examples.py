@@ -2,13 +2,14 @@
 
     python scripts/run_doc_examples.py README.md docs/*.md
 
-A comment in the line above a block changes how it is run:
+Comments in the lines above a block change how it is run:
 
     <!-- example: with tandem teacher --listen 127.0.0.1:7001 ... -->   starts a server for the block
     <!-- example: needs torch -->                                       skips the block without this module
+    <!-- example: where NAME=VALUE, NAME=VALUE -->                      replaces names in the block
 
-A server's command has the program of this repository in its path and a temporary directory in `$WORK`. Exits with 1 if
-an example fails.
+Servers and blocks have the program of this repository in their path. In a server's command and in values `$WORK` is a
+temporary directory. Exits with 1 if an example fails.
 """
 
 import contextlib
@@ -23,7 +24,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"(?:^<!-- example: (with|needs) (.*?) -->\n)?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"((?:^<!-- example: .*? -->\n)*)^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+COMMENT = re.compile(r"<!-- example: (with|needs|where) (.*?) -->")
 LISTEN = re.compile(r"--listen (\S+):(\d+)")
 TIMEOUT_S = 300
 START_TIMEOUT_S = 30
@@ -34,13 +36,21 @@ def main(paths: list[str]) -> int:
     for path in paths:
         text = Path(path).read_text()
         for match in BLOCK.finditer(text):
-            place = f"{path}:{text.count(chr(10), 0, match.start(3))}"
-            if match[1] == "needs" and importlib.util.find_spec(match[2]) is None:
-                print(f"{place}: skipped, needs {match[2]}")
+            place = f"{path}:{text.count(chr(10), 0, match.start(2))}"
+            comments = dict(COMMENT.findall(match[1]))
+            module = comments.get("needs")
+            if module and importlib.util.find_spec(module) is None:
+                print(f"{place}: skipped, needs {module}")
                 continue
-            with server(match[2]) if match[1] == "with" else contextlib.nullcontext():
-                n_failed += not runs(place, match[3])
+            with server(comments["with"]) if "with" in comments else contextlib.nullcontext():
+                n_failed += not runs(place, match[2], comments.get("where"))
     return 1 if n_failed else 0
+
+
+def with_programs() -> dict[str, str]:
+    """Returns the environment variables of a process that finds the program of this repository."""
+    programs = ROOT / os.environ.get("CARGO_TARGET_DIR", "target") / "release"
+    return {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
 
 
 @contextlib.contextmanager
@@ -48,9 +58,7 @@ def server(command: str):
     """Runs a command until the block is left, and enters it once the address after `--listen` accepts connections."""
     host, port = LISTEN.search(command).groups()
     with tempfile.TemporaryDirectory() as directory:
-        programs = ROOT / os.environ.get("CARGO_TARGET_DIR", "target") / "release"
-        path = f"{programs}:{os.environ['PATH']}"
-        environment = {**os.environ, "PATH": path, "WORK": directory}
+        environment = {**with_programs(), "WORK": directory}
         process = subprocess.Popen(["bash", "-c", f"exec {command}"], cwd=ROOT, env=environment)
         try:
             deadline = time.monotonic() + START_TIMEOUT_S
@@ -70,15 +78,26 @@ def accepts(host: str, port: int) -> bool:
     return False
 
 
-def runs(place: str, code: str) -> bool:
+def runs(place: str, code: str, where: str | None) -> bool:
     """Runs a block and prints its place with the outcome."""
     with tempfile.TemporaryDirectory() as directory:
+        for pair in re.split(r",\s+", where) if where else ():
+            name, value = pair.split("=", 1)
+            if name not in code:
+                raise SystemExit(f"{place}: the block has no {name!r}")
+            code = code.replace(name, value.replace("$WORK", directory))
         script = Path(directory, "example.py")
         script.write_text(code)
         command = [sys.executable, "-W", "error", str(script)]
         try:
             result = subprocess.run(
-                command, cwd=ROOT, timeout=TIMEOUT_S, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+                command,
+                cwd=ROOT,
+                env=with_programs(),
+                timeout=TIMEOUT_S,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
             )
             output, is_good = result.stdout, result.returncode == 0
         except subprocess.TimeoutExpired:

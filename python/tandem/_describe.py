@@ -134,7 +134,8 @@ def appends_goal(env: gymnasium.Env[Any, Any], task: Task) -> bool:
     expected = (task.n_observation, task.n_goal, task.n_action)
     for name, length, its in zip(("observation", "goal", "action"), found, expected):
         if length != its:
-            raise ServiceError(f"the environment is not that of task {task.name!r}: {name} of length {length}, not {its}")
+            difference = f"{name} of length {length}, not {its}"
+            raise ServiceError(f"the environment is not that of task {task.name!r}: {difference}")
     return appends
 
 

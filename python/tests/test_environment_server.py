@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from goal_env import STEPS, PointEnv
+from services import program
 
 pytest.importorskip("grpc")
 
@@ -180,6 +181,17 @@ def test_faults_of_environments_are_reported_with_their_text() -> None:
                 assert Client(server).refusal(requests) == ("DATA_LOSS", expected)
     with tandem.EnvironmentServer((ID, {"exits_at": 11})) as server:
         assert Client(server).refusal(requests) == ("INTERNAL", "environment 0: SystemExit: the motor is gone")
+
+
+def test_a_run_ends_when_an_environment_terminates_without_its_goal(tmp_path: Path) -> None:
+    script = tmp_path / "serve.py"
+    served = f"tandem.serve(({ID!r}, {{'terminates_at': 11}}))"
+    script.write_text(f"import sys, tandem; sys.path.insert(0, {str(TESTS)!r})\n{served}\n")
+    command = [program(), "train", "--quiet", "--no-dashboard", "--workers", "1", "--out", str(tmp_path / "run")]
+    command += ["--env-command", f"'{sys.executable}' '{script}'"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (65, "", 1), result
+    assert "environment 0: the environment terminated at step 11 without its goal" in result.stderr
 
 
 def test_an_environment_that_breaks_the_rules_is_refused_at_the_start() -> None:
