@@ -45,13 +45,23 @@ fn find_teacher(task: &str, suffix: &str) -> Result<PathBuf, Failed> {
         next_to_program,
         Some(Path::new(env!("CARGO_MANIFEST_DIR")).join(&name)),
     ];
-    candidates.into_iter().flatten().find(|path| path.exists()).ok_or_else(|| {
-        let flags = task.parse().map_or_else(|_unknown| format!("--task {task}"), task_flags);
-        Failed::usage(format!(
-            "{name}, the shipped teacher of {task}, does not exist: train one with `tandem train --arms 1 {flags}` \
-             and name its policy/best.safetensors with --teacher"
-        ))
-    })
+    let found = candidates.into_iter().flatten().find(|path| path.exists());
+    found.ok_or_else(|| Failed::usage(no_teacher(&name, task)))
+}
+
+/// Describes how to get a teacher for `task`, for which `file` does not ship.
+fn no_teacher(file: &str, task: &str) -> String {
+    match task.parse() {
+        Ok(built_in) => format!(
+            "{file}, the shipped teacher of {task}, does not exist: train one with `tandem train --arms 1 {}` and name \
+             its policy/best.safetensors with --teacher",
+            task_flags(built_in)
+        ),
+        Err(_) => format!(
+            "{task} has no shipped teacher: train one in a one-arm environment of the task (docs/environments.md), then \
+             give --teacher FILE, or choose --strategy none"
+        ),
+    }
 }
 
 /// Returns the name under which the policies of a task ship: that of the task, and its world unless that is the default.
@@ -82,5 +92,15 @@ mod tests {
         }
         assert_eq!(shipped_name("carry-bar"), "carry-bar");
         assert_eq!(shipped_name("FetchPush-v4"), "FetchPush-v4");
+    }
+
+    #[test]
+    fn only_for_built_in_tasks_a_missing_teacher_is_trained_with_the_name_of_the_task() {
+        let built_in = no_teacher("policies/x.safetensors", "shared-push");
+        assert!(built_in.contains("`tandem train --arms 1 --task push`"), "{built_in}");
+        let served = shipped_teacher("lift-rod").expect_err("does not ship").line();
+        assert!(served.starts_with("lift-rod has no shipped teacher: "), "{served}");
+        assert!(!served.contains("--task"), "{served}");
+        assert!(served.contains("--teacher FILE, or choose --strategy none"), "{served}");
     }
 }
