@@ -71,7 +71,7 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         if let Err(failed) = checked {
             output::message(failed.line());
         }
-        return print_plan(&statuses, &out, args.json);
+        return print_plan((args.only.unwrap_or(0), &statuses), &out, args.json);
     }
     checked?;
     let address = dashboard::address(&args.dashboard)?;
@@ -360,20 +360,23 @@ fn extends(n_runs: usize) -> String {
     format!("{} {verb} extended", counted(n_runs, "run"))
 }
 
-fn print_plan(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {
+/// Prints the runs with the numbers that `--only` takes; that of the first is `first`.
+fn print_plan(
+    (first, statuses): (usize, &[RunStatus]),
+    out: &Path,
+    as_json: bool,
+) -> Result<(), Failed> {
+    let numbered = statuses.iter().zip(first..);
     if as_json {
-        let runs: Vec<Value> = statuses
-            .iter()
-            .map(|status| {
-                json!({"name": status.run.name, "state": status.state_name(), "failure": status.failure})
-            })
-            .collect();
+        let run = |(status, number): (&RunStatus, usize)| json!({"index": number, "name": status.run.name, "state": status.state_name(), "failure": status.failure});
+        let runs: Vec<Value> = numbered.map(run).collect();
         return output::print(json!({"out": out.to_string_lossy(), "runs": runs}));
     }
-    for status in statuses {
+    for (status, number) in numbered {
         let failure = status.failure.as_ref();
         let failure = failure.map_or_else(String::new, |why| format!(", failed before: {why}"));
-        output::print(format_args!("{:<10}{}{failure}", status.state_name(), status.run.name))?;
+        let (state, name) = (status.state_name(), &status.run.name);
+        output::print(format_args!("{number:>3}  {state:<10}{name}{failure}"))?;
     }
     output::print(format_args!("{} in {}", counted(statuses.len(), "run"), out.display()))
 }

@@ -352,6 +352,14 @@ fn runs_of_a_sweep_are_trained_by_several_commands() {
     }
     let plan = sweep(&file, &out, &["--dry-run"]).output().expect("lists");
     assert_eq!(text(&plan.stdout).matches("finished").count(), 2, "{}", text(&plan.stdout));
+    assert!(
+        text(&plan.stdout).contains("  1  finished  shared-push-none-seed2\n"),
+        "{}",
+        text(&plan.stdout)
+    );
+    let planned = last_object(&only("1").arg("--dry-run").output().expect("lists"));
+    let (run, named) = (&planned["runs"][0], "shared-push-none-seed2");
+    assert_eq!((&run["index"], &run["name"]), (&1.into(), &named.into()), "the number of --only");
     let refused = only("2").output().expect("ends");
     assert_eq!(refused.status.code(), Some(64));
     assert!(text(&refused.stderr).contains("expected 0 to 1"), "{}", text(&refused.stderr));

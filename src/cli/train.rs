@@ -153,14 +153,14 @@ pub(crate) struct SweepArgs {
     /// Number of concurrent runs; they share the cores.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     pub(crate) jobs: u16,
-    /// Trains only run N of the list, from 0. Several such commands may work in one directory at a time, also on several
-    /// machines that share it.
+    /// Trains only run N of the list, from 0; --dry-run prints the numbers. Several such commands may work in one
+    /// directory at a time, also on several machines that share it.
     #[arg(long, value_name = "N", conflicts_with = "jobs")]
     pub(crate) only: Option<usize>,
     /// Prints one JSON object on the last line of standard output.
     #[arg(long)]
     pub(crate) json: bool,
-    /// Lists the runs and the progress of each, and starts none.
+    /// Lists the runs with their numbers and their progress, and starts none.
     #[arg(long)]
     pub(crate) dry_run: bool,
     #[command(flatten)]
