@@ -57,6 +57,9 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
+    if args.print_run {
+        return plan::print_run_file(args, served.as_ref());
+    }
     // An address in use is reported before anything is written.
     let metrics = metrics::free_address(&args.metrics)?;
     let plan = Plan { metrics, ..Plan::of(args, environment, served.as_ref())? };

@@ -336,3 +336,19 @@ fn a_task_without_a_server_is_refused() {
     let what = "task \"lab/reach\" is not built-in: name the server of its environments with --env";
     check_refused(&refused, 64, what);
 }
+
+#[test]
+fn the_run_file_of_a_served_task_contains_its_description() {
+    let (server, keep) =
+        (ReachServer::start(two_arms()), tempfile::tempdir().expect("a directory"));
+    let file = keep.path().join("run.toml");
+    let print = |args: &[&str]| run(&[&["train", "--print-run"], args].concat());
+    let printed = print(&["--env", &server.address, "--strategy", "none"]);
+    assert!(printed.status.success(), "{}", stderr(&printed));
+    let text = String::from_utf8_lossy(&printed.stdout);
+    assert!(text.contains("task = \"lab/reach\"") && text.contains("\n[description]\n"), "{text}");
+    fs::write(&file, &printed.stdout).expect("writes");
+    let again = print(&["--env", &server.address, "--run", self::text(&file)]);
+    assert_eq!(again.stdout, printed.stdout, "{}", stderr(&again));
+    check_refused(&print(&["--run", self::text(&file)]), 64, "with --env or --env-command");
+}

@@ -31,7 +31,7 @@ EVALUATION = {"episodes": 8, "every_env_steps": 800, "early_points": 0, "test_ep
 def main(arguments: list[str]) -> None:
     program = os.environ["GUIDE_PROGRAM"]
     shorten = RULES.get(arguments[0] if arguments else "")
-    if shorten and not {"--help", "--settings"} & set(arguments):
+    if shorten and not {"--help", "--settings", "--print-run"} & set(arguments):
         arguments = shorten(arguments)
     print("as run: tandem", *arguments, file=open(os.environ["GUIDE_LOG"], "a"))
     os.execv(program, [program, *arguments])

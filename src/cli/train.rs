@@ -29,6 +29,8 @@ Examples:
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
   tandem train --teacher http://127.0.0.1:7005  # a policy in another process
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
+  tandem train --arms 1 --recipe paper --print-run > my-run.toml
+      # every setting of this run
   tandem train --run my-run.toml --out runs/mine --quiet
   tandem train --recipe paper \\
       --teacher runs/teacher-push-paper/policy/best.safetensors
@@ -98,9 +100,16 @@ pub(crate) struct TrainArgs {
     /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
-    /// Prints every setting with its meaning, its range and its values under both recipes, and starts nothing.
-    #[arg(long = "settings")]
+    /// Prints every setting with its meaning, its range and its values under both recipes, for all tasks and numbers of
+    /// arms, and starts nothing. --print-run prints the values of one run.
+    #[arg(long = "settings", conflicts_with_all = [
+        "task", "world", "arms", "strategy", "teacher", "budget", "env", "env_command", "seed", "until_success",
+        "max_env_steps", "max_minutes", "recipe", "run", "settings", "print_run", "out", "resume"])]
     pub(crate) list_settings: bool,
+    /// Prints the run file of the other options, with every setting, and starts no run; --run takes it. Teacher, workers
+    /// and environments are no settings: name them again. --env and --env-command are asked for their task.
+    #[arg(long, conflicts_with_all = ["resume", "json"])]
+    pub(crate) print_run: bool,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,

@@ -46,22 +46,11 @@ impl Plan {
         environment: EnvironmentArgs,
         served: Option<&ServedTask>,
     ) -> Result<Self, Failed> {
-        let config = config(args, served)?;
-        check_environment(&config, served)?;
-        let out = match &args.out {
-            Some(out) => out.clone(),
-            None => {
-                let (base, out) = free_run_directory(&config);
-                if out != base && !args.quiet {
-                    remark_on(&base, &out);
-                }
-                out
-            }
-        };
-        let config = match args.resume {
-            true => config,
-            false => RunConfig { name: account_name(&out).unwrap_or(config.name), ..config },
-        };
+        let (config, directory) = named_config(args, served)?;
+        if directory.is_numbered() && !args.quiet {
+            remark_on(&directory);
+        }
+        let out = directory.path;
         let teacher = match config.advice.needs_teacher() {
             true => Some(teacher_file(args, &config, &out)?),
             false => None,
@@ -217,6 +206,29 @@ impl Plan {
     }
 }
 
+/// Prints the run file of the run that the command line describes: all its settings. `served` is as in [`Plan::of`].
+pub(super) fn print_run_file(args: &TrainArgs, served: Option<&ServedTask>) -> Result<(), Failed> {
+    let (config, _) = named_config(args, served)?;
+    check_advice_options(args, &config)?;
+    output::print(run_file::to_text(&config)?.trim_end())
+}
+
+/// Resolves the settings, among them the run's name, and the run directory.
+fn named_config(
+    args: &TrainArgs,
+    served: Option<&ServedTask>,
+) -> Result<(RunConfig, NewDirectory), Failed> {
+    let config = config(args, served)?;
+    check_environment(&config, served)?;
+    let directory = match &args.out {
+        Some(out) => NewDirectory { path: out.clone(), usual: out.clone() },
+        None => NewDirectory::free(&config),
+    };
+    let name = account_name(&directory.path).filter(|_| !args.resume);
+    let config = RunConfig { name: name.unwrap_or_else(|| config.name.clone()), ..config };
+    Ok((config, directory))
+}
+
 /// Rejects a task that neither the server nor the simulator has.
 fn check_environment(config: &RunConfig, served: Option<&ServedTask>) -> Result<(), Failed> {
     let task = config.layout().or_exit(Exit::Usage, String::new)?;
@@ -349,29 +361,41 @@ fn account_name(out: &Path) -> Option<String> {
     tandem_rl::config::is_name(name).then(|| name.to_owned())
 }
 
+/// The directory of a run.
+struct NewDirectory {
+    path: PathBuf,
+    /// The path that it has unless that exists.
+    usual: PathBuf,
+}
+
+impl NewDirectory {
+    /// Returns `runs/TASK-ARMS-STRATEGY-seedN`, with a number appended if that exists.
+    fn free(config: &RunConfig) -> Self {
+        let strategy = config.advice.strategy.replace(':', "-");
+        let task = config.task.replace('/', "-");
+        let name = format!("{task}-{}-{strategy}-seed{}", config.arms, config.seed);
+        let usual = Path::new(RUNS).join(name);
+        let numbered = (2..).map(|n: u32| PathBuf::from(format!("{}.{n}", usual.display())));
+        let free = std::iter::once(usual.clone()).chain(numbered).find(|path| !path.exists());
+        Self { path: free.unwrap_or_else(|| usual.clone()), usual }
+    }
+
+    fn is_numbered(&self) -> bool {
+        self.path != self.usual
+    }
+}
+
 /// Reports that the run has another directory than usual, because there is a run in that one.
-fn remark_on(base: &Path, out: &Path) {
-    let what = match base.join("run.toml").exists() {
+fn remark_on(NewDirectory { path, usual }: &NewDirectory) {
+    let what = match usual.join("run.toml").exists() {
         true => {
-            let (state, word) = (run_directory::state(base), shell_word(base));
+            let (state, word) = (run_directory::state(usual), shell_word(usual));
             format!("{state}; `tandem train --resume --out {word}` resumes it")
         }
         false => "it holds no run".to_owned(),
     };
-    let text = format!("{} exists ({what}): this run is {}", base.display(), out.display());
+    let text = format!("{} exists ({what}): this run is {}", usual.display(), path.display());
     output::message(wrapped(&text, "  "));
-}
-
-/// Returns `runs/TASK-ARMS-STRATEGY-seedN`, and the same with a number appended if that exists.
-fn free_run_directory(config: &RunConfig) -> (PathBuf, PathBuf) {
-    let strategy = config.advice.strategy.replace(':', "-");
-    let task = config.task.replace('/', "-");
-    let name = format!("{task}-{}-{strategy}-seed{}", config.arms, config.seed);
-    let base = Path::new(RUNS).join(name);
-    let numbered = (2..).map(|n: u32| PathBuf::from(format!("{}.{n}", base.display())));
-    let free = std::iter::once(base.clone()).chain(numbered).find(|path| !path.exists());
-    let free = free.unwrap_or_else(|| base.clone());
-    (base, free)
 }
 
 /// Rejects options about advice for a run without any.
