@@ -6,21 +6,18 @@ use tonic::{Code, Status};
 
 use crate::exit::{Exit, Failed};
 
-/// Returns the failure of a call. `start` is the command that starts a service of the called kind; empty for no advice.
-pub(crate) fn failed(exit: Exit, status: &Status, start: &str) -> Failed {
+/// Returns the failure of a call. `advice` is what to do if nothing listens at the address; empty for no advice.
+pub(crate) fn failed(exit: Exit, status: &Status, advice: &str) -> Failed {
     let message = status.message();
-    match hint(status, start) {
+    match hint(status, advice) {
         Some(hint) => Failed::new(exit, anyhow!("{message}; {hint}")),
         None => Failed::new(exit, anyhow!("{message}")),
     }
 }
 
-fn hint(status: &Status, start: &str) -> Option<String> {
+fn hint(status: &Status, advice: &str) -> Option<String> {
     if status.code() == Code::Unavailable && status.message().ends_with(NOTHING_LISTENS) {
-        if start.is_empty() {
-            return None;
-        }
-        return Some(format!("start one with `{start}`"));
+        return (!advice.is_empty()).then(|| advice.to_owned());
     }
     let WrongService { name, address } = WrongService::of(status)?;
     Some(match name.as_str() {
@@ -35,11 +32,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_call_that_nothing_answers_names_the_command_that_starts_the_service() {
+    fn a_call_that_nothing_answers_gets_the_advice() {
         let refused = Status::unavailable(format!("x:1 does not answer: {NOTHING_LISTENS}"));
-        assert_eq!(hint(&refused, "tandem y").as_deref(), Some("start one with `tandem y`"));
+        assert_eq!(hint(&refused, "start it").as_deref(), Some("start it"));
         assert_eq!(hint(&refused, ""), None);
         let broken = Status::unavailable("x:1 does not answer: connection reset");
-        assert_eq!(hint(&broken, "tandem y"), None);
+        assert_eq!(hint(&broken, "start it"), None);
     }
 }

@@ -96,7 +96,7 @@ pub(crate) enum Command {
     Bridge(BridgeArgs),
     /// Checks the health of a service.
     Health(HealthArgs),
-    /// Shows the progress of a learner's run.
+    /// Shows the progress of a run.
     Status(StatusArgs),
     /// Benchmarks the simulator, networks, updates, replay buffer and a short run on this machine.
     Bench(BenchArgs),

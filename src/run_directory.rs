@@ -24,6 +24,16 @@ pub(crate) fn ledger(out: &Path) -> PathBuf {
     out.join("ledger.sqlite")
 }
 
+/// Returns the directory of the files that exist while `tandem train` works on the run.
+pub(crate) fn in_use(out: &Path) -> PathBuf {
+    out.join("in-use")
+}
+
+/// Returns the file with the address of the learner that `tandem train` has started.
+pub(crate) fn learner_address(out: &Path) -> PathBuf {
+    in_use(out).join("learner")
+}
+
 /// Returns the round of the newest checkpoint of the run in `out`, if there is one.
 pub(crate) fn saved_round(out: &Path) -> Option<u64> {
     let checkpoints = tandem_learner::checkpoint::list(&checkpoints(out));

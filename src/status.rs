@@ -1,5 +1,6 @@
 //! `tandem status`: shows the progress of a run, from any machine that can reach its learner.
 
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::anyhow;
@@ -15,7 +16,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_json::progress_json;
 use crate::progress_text::{counts_line, evaluation_line, state_lines, warning_line};
 use crate::run_display::Display;
-use crate::{access, call_failure, output, runtime};
+use crate::{access, call_failure, output, run_directory, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -24,17 +25,58 @@ const LINE_EVERY_S: f64 = 30.0;
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let client_config = access::client_config(&args.client_config, &args.secret)?;
+    let address = address_of(&args.run)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let link = client_config.channel(&args.address).or_exit(Exit::Usage, String::new)?;
-        let mut learner = LearnerClient::new(link);
+        let no_directory = || format!("there is no directory {}", args.run.display());
+        let link = client_config.channel(&address).or_exit(Exit::Usage, no_directory)?;
+        let mut learner = Learner {
+            client: LearnerClient::new(link),
+            advice: match args.run.is_dir() {
+                true => "its run is starting or ending: try again",
+                false => "`tandem status DIR` shows a `tandem train` by its run directory",
+            },
+            address,
+        };
         if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
     })
 }
 
+/// The learner of a run.
+struct Learner {
+    client: LearnerClient<AuthChannel>,
+    address: String,
+    /// What to do if nothing listens at the address.
+    advice: &'static str,
+}
+
+/// Returns the address of a learner, which is given, or that of the `tandem train` whose run directory is given.
+fn address_of(run: &Path) -> Result<String, Failed> {
+    if !run.is_dir() {
+        return Ok(run.to_string_lossy().into_owned());
+    }
+    let shown = run.display();
+    if !run.join("run.toml").exists() {
+        return Err(run_directory::no_run(&format!("{shown} holds no run")));
+    }
+    let no_learner = || {
+        let state = run_directory::state(run);
+        let what = anyhow!("no learner of a `tandem train` is running in {shown} ({state})");
+        Failed::new(Exit::TryAgain, what)
+    };
+    let path = run_directory::learner_address(run);
+    let address = std::fs::read_to_string(path).map_err(|_missing| no_learner())?;
+    // A `tandem train` that was killed has left the address, at which another program may listen now.
+    match run_directory::lock(run)? {
+        Some(_is_unused) => Err(no_learner()),
+        None => Ok(address.trim().to_owned()),
+    }
+}
+
 /// Prints the current progress.
-async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
-    let progress = call_with_timeout(learner.status(pb::StatusRequest {})).await?;
+async fn show(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
+    let call = learner.client.status(pb::StatusRequest {});
+    let progress = call_with_timeout(call, learner.advice).await?;
     if args.json {
         output::print(progress_json(&progress))?;
     } else {
@@ -45,17 +87,18 @@ async fn show(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Re
 
 /// Shows the progress until the run has ended: live on a terminal, elsewhere a line for each evaluation and every half
 /// minute, or each message as JSON.
-async fn watch(learner: &mut LearnerClient<AuthChannel>, args: &StatusArgs) -> Result<(), Failed> {
-    let mut stream = call_with_timeout(learner.watch(pb::WatchRequest {})).await?;
+async fn watch(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
+    let call = learner.client.watch(pb::WatchRequest {});
+    let mut stream = call_with_timeout(call, learner.advice).await?;
     let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
     let is_live = !args.json && output::is_terminal();
     let mut display = is_live.then(|| Display::new(false));
     loop {
         let progress = match stream.message().await {
             Ok(Some(progress)) => progress,
-            Err(status) if !is_lost(&status) => return Err(failed(&status)),
+            Err(status) if !is_lost(&status) => return Err(failed(&status, learner.advice)),
             Ok(None) | Err(_) => {
-                let address = &args.address;
+                let address = &learner.address;
                 let lost = anyhow!("the learner at {address} is gone before the end of the run");
                 return Err(Failed::new(Exit::TryAgain, lost));
             }
@@ -91,9 +134,12 @@ fn is_lost(status: &Status) -> bool {
 /// Runs a call with a timeout.
 async fn call_with_timeout<T>(
     call: impl Future<Output = Result<Response<T>, Status>>,
+    advice: &str,
 ) -> Result<T, Failed> {
     match tokio::time::timeout(TIMEOUT, call).await {
-        Ok(response) => response.map(Response::into_inner).map_err(|status| failed(&status)),
+        Ok(response) => {
+            response.map(Response::into_inner).map_err(|status| failed(&status, advice))
+        }
         Err(_elapsed) => {
             let what = anyhow!("the learner did not respond within {TIMEOUT:?}");
             Err(Failed::new(Exit::TryAgain, what))
@@ -101,12 +147,12 @@ async fn call_with_timeout<T>(
     }
 }
 
-fn failed(status: &Status) -> Failed {
+fn failed(status: &Status, advice: &str) -> Failed {
     let exit = match status.code() {
         Code::Unauthenticated | Code::Unimplemented => Exit::Usage,
         _ => Exit::TryAgain,
     };
-    call_failure::failed(exit, status, "tandem train")
+    call_failure::failed(exit, status, advice)
 }
 
 fn lines(progress: &pb::Progress) -> Vec<String> {

@@ -114,6 +114,12 @@ async fn run(
     };
     let last = match started {
         Ok(()) => {
+            // Without the address, `tandem status` needs it from its user; the run continues.
+            if let Err(failed) =
+                inputs::write_learner_address(&plan.out, processes.learner_address())
+            {
+                display.print(&failed.line());
+            }
             let mut supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
             supervisor.prints_json = args.progress_json;
             supervisor.run(interrupted).await

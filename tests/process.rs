@@ -313,6 +313,35 @@ fn a_learner_that_cannot_continue_ends_the_run_with_its_error_message() {
     assert!(last.contains("the learner ended with exit code 65: checkpoint"), "{messages}");
 }
 
+/// Returns exit code, standard output and standard error of `tandem status` of a run directory.
+fn status(out: &Path) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    let ended = command.arg("status").arg(out).stdin(Stdio::null()).output().expect("runs");
+    (ended.status.code(), String::from_utf8_lossy(&ended.stdout).into_owned(), stderr(&ended))
+}
+
+#[test]
+fn a_run_directory_leads_to_the_learner_of_its_run_and_to_no_other_program() {
+    let (_keep, out) = run_directory();
+    let mut run = start_with("1", LONG, &[], &out);
+    let is_shown = || {
+        let (code, text, _) = status(&out);
+        code == Some(0) && text.contains("shared-push with 2 arms")
+    };
+    assert!(eventually(is_shown), "{:?}", status(&out));
+    kill_one(&run, "learner");
+    assert!(eventually(is_shown), "the restarted learner: {:?}", status(&out));
+    signal("-KILL", run.id());
+    run.wait().expect("the run has ended");
+    // Another service listens at an address that a killed run has left.
+    let other = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = other.local_addr().expect("bound").to_string();
+    fs::write(out.join("in-use/learner"), address).expect("the file is there");
+    let (code, _, message) = status(&out);
+    assert_eq!(code, Some(75), "{message}");
+    assert!(message.contains("no learner of a `tandem train` is running in"), "{message}");
+}
+
 #[test]
 fn children_end_when_their_parent_is_killed() {
     let (_keep, out) = run_directory();

@@ -62,7 +62,7 @@ async fn within<T>(
 
 /// Converts the status of a failed call.
 pub(super) fn failed(status: &Status) -> Failed {
-    call_failure::failed(exit(status), status, "tandem bridge --driver sim")
+    call_failure::failed(exit(status), status, "start one with `tandem bridge --driver sim`")
 }
 
 fn exit(status: &Status) -> Exit {

@@ -1,5 +1,6 @@
 //! The command line of `tandem health` and `tandem status`.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
@@ -36,6 +37,8 @@ pub(crate) struct HealthArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
+  tandem status runs/mine          # of a running `tandem train`
+  tandem status runs/mine --watch
   tandem status 127.0.0.1:7000
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
@@ -43,9 +46,9 @@ Examples:
 Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be \
 reached.")]
 pub(crate) struct StatusArgs {
-    /// Address of the learner or relay.
-    #[arg(value_name = "ADDR")]
-    pub(crate) address: String,
+    /// Run directory of a `tandem train` on this machine, or address of a learner or relay.
+    #[arg(value_name = "DIR|ADDR")]
+    pub(crate) run: PathBuf,
     /// Follows the run until it ends, as `tandem train` shows it: with a progress bar on a terminal, elsewhere with a line for
     /// each evaluation and one every half minute.
     #[arg(long)]

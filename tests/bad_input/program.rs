@@ -118,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 101] = [
+const CASES: [(&str, i32, &str); 104] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -226,7 +226,10 @@ const CASES: [(&str, i32, &str); 101] = [
     ("bridge move /dev/zero", 65, "it has more than 16 MiB"),
     ("bridge move @no-speed.json", 65, "it has no speed: add \"speed\": 1.0, or give --speed"),
     ("bridge status --connect 127.0.0.1:1", 75, "start one with `tandem bridge --driver sim`"),
-    ("status 127.0.0.1:1", 75, "nothing listens there; start one with `tandem train`"),
+    ("status 127.0.0.1:1", 75, "nothing listens there; `tandem status DIR` shows a `tandem train`"),
+    ("status @missing", 64, "expected HOST:PORT"),
+    ("status @folder", 64, "holds no run"),
+    ("status @runs/half", 75, "no learner of a `tandem train` is running in"),
     ("train --resume", 64, "there are: runs/half (not saved yet)"),
     ("train --resume --out @out", 64, "holds no run to resume; there are: runs/half"),
     ("health 127.0.0.1:1 --tls-ca /dev/zero", 64, "it has more than 16 MiB"),
