@@ -50,7 +50,7 @@ pub(crate) use trial::{ModeName, RecordName, TrialArgs};
 Examples:
   tandem train                       # trains two arms to push, with advice
   tandem train --arms 1 --task push  # trains a one-arm teacher from scratch
-  tandem eval --policy runs/NAME/policy/best.safetensors
+  tandem eval --policy runs/NAME     # evaluates the best policy of a run
   tandem COMMAND --help              # more examples
 
 Exit codes: 0 success, 64 wrong usage or configuration, 65 invalid input data, 70 bug, 74 the \

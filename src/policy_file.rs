@@ -1,7 +1,9 @@
 //! Policy files: loading them, and the shipped teachers.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
+use anyhow::anyhow;
 use tandem_core::{Task, World};
 use tandem_policy::Policy;
 use tandem_rl::config::Recipe;
@@ -10,8 +12,29 @@ use tandem_teacher::policy::is_onnx;
 use crate::cli::task_flags;
 use crate::exit::{Exit, Failed, OrExit as _};
 
-/// Loads a policy file.
+/// The best policy of a run, in its directory.
+pub(crate) const BEST: &str = "policy/best.safetensors";
+
+/// Returns the policy file that the command line names: `path` itself or, if it is a run directory, the best policy of
+/// the run.
+pub(crate) fn file_of(path: &Path) -> Result<Cow<'_, Path>, Failed> {
+    if !path.is_dir() {
+        return Ok(path.into());
+    }
+    let best = path.join(BEST);
+    if best.exists() {
+        return Ok(best.into());
+    }
+    let what = anyhow!(
+        "{} is a directory without {BEST}: name a policy file, or the directory of a run that was evaluated",
+        path.display()
+    );
+    Err(Failed::new(Exit::Data, what))
+}
+
+/// Loads a policy file, or the best policy of a run directory.
 pub(crate) fn load(path: &Path) -> Result<Policy, Failed> {
+    let path = &*file_of(path)?;
     if is_onnx(path) {
         let shown = path.display();
         return Err(Failed::usage(format!(
@@ -54,7 +77,7 @@ fn no_teacher(file: &str, task: &str) -> String {
     match task.parse() {
         Ok(built_in) => format!(
             "{file}, the shipped teacher of {task}, does not exist: train one with `tandem train --arms 1 {}` and name \
-             its policy/best.safetensors with --teacher",
+             its directory with --teacher",
             task_flags(built_in)
         ),
         Err(_) => format!(
@@ -92,6 +115,19 @@ mod tests {
         }
         assert_eq!(shipped_name("carry-bar"), "carry-bar");
         assert_eq!(shipped_name("FetchPush-v4"), "FetchPush-v4");
+    }
+
+    #[test]
+    fn a_run_directory_stands_for_its_best_policy() {
+        let run = tempfile::tempdir().expect("a directory");
+        let refused = load(run.path()).expect_err("has no policy");
+        assert!(refused.line().contains("without policy/best.safetensors"), "{}", refused.line());
+        std::fs::create_dir(run.path().join("policy")).expect("creates");
+        let shipped = shipped_teacher("push").expect("ships");
+        std::fs::copy(&shipped, run.path().join(BEST)).expect("copies");
+        let loaded = load(run.path()).expect("the best policy");
+        assert_eq!(loaded.digest(), load(&shipped).expect("a policy").digest());
+        assert_eq!(file_of(&shipped).expect("a file"), shipped);
     }
 
     #[test]

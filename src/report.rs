@@ -149,8 +149,10 @@ fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> Test
     }
 }
 
+/// Returns the name of a file without its ending, or of a run directory.
 fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    let name = if path.is_dir() { path.file_name() } else { path.file_stem() };
+    name.unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 /// Plays the test goals with each policy of `--film-strips` and draws the first success and the first failure.

@@ -4,7 +4,11 @@ use std::path::Path;
 
 /// Returns a path as a word of a shell's command line.
 pub(crate) fn shell_word(path: &Path) -> String {
-    let text = path.display().to_string();
+    shell_text(path.display().to_string())
+}
+
+/// Returns a text as a word of a shell's command line.
+pub(crate) fn shell_text(text: String) -> String {
     let is_plain = |c: char| c.is_alphanumeric() || "/._-+:,=@%".contains(c);
     match !text.is_empty() && text.chars().all(is_plain) {
         true => text,

@@ -134,7 +134,8 @@ const fn mode_of(name: ModeName) -> TrialMode {
 fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
     let mut policies = Vec::new();
     for path in &args.policies {
-        let policy = policy_file::load(path)?;
+        let file = policy_file::file_of(path)?;
+        let policy = policy_file::load(&file)?;
         if policy.layout.n_arms() != 2 {
             return Err(Failed::usage(format!(
                 "{} drives {}, the bridge has 2: a one-arm policy goes with --composed-teachers",
@@ -142,10 +143,11 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
                 counted(policy.layout.n_arms(), "arm")
             )));
         }
-        policies.push(NamedPolicy { name: name_of(path), policy });
+        policies.push(NamedPolicy { name: name_of(&file), policy });
     }
     for path in &args.composed_teachers {
-        let policy = policy_file::load(path)?;
+        let file = policy_file::file_of(path)?;
+        let policy = policy_file::load(&file)?;
         if policy.layout.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
@@ -153,7 +155,7 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
                 policy.layout.n_arms()
             )));
         }
-        policies.push(NamedPolicy { name: format!("composed-{}", name_of(path)), policy });
+        policies.push(NamedPolicy { name: format!("composed-{}", name_of(&file)), policy });
     }
     let mut names = BTreeSet::new();
     if let Some(again) = policies.iter().find(|named| !names.insert(&named.name)) {

@@ -36,7 +36,7 @@ Examples:
   tandem policy show policies/student-push.safetensors
   tandem policy show actor.onnx --json")]
 pub(crate) struct ShowArgs {
-    /// Policy file, or an ONNX model (*.onnx).
+    /// Policy file, run directory, or ONNX model (*.onnx).
     pub(crate) file: PathBuf,
     /// Prints one JSON object.
     #[arg(long)]
@@ -52,7 +52,7 @@ Examples:
 The models normalise their inputs themselves. Actor: inputs observation and goal, output action. \
 Critic: inputs observation, goal and action, output value. docs/onnx.md describes the vectors.")]
 pub(crate) struct ExportArgs {
-    /// Policy file.
+    /// Policy file, or a run directory.
     pub(crate) file: PathBuf,
     /// Output file of the actor.
     #[arg(long, value_name = "FILE.onnx", group = "to")]
@@ -111,7 +111,7 @@ Where arms are interchangeable, the best action of a scene does not depend on th
 policy computes the mean for both orders, in networks twice as wide. Runs save such policies unless \
 evaluation.symmetrized is false.")]
 pub(crate) struct SymmetrizeArgs {
-    /// Policy file.
+    /// Policy file, or a run directory.
     pub(crate) file: PathBuf,
     /// Output file.
     #[arg(long, value_name = "FILE.safetensors")]

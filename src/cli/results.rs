@@ -11,6 +11,7 @@ use super::{ClientArgs, EnvironmentArgs, LiveArgs, SecretArgs, TaskName, WorldNa
 #[command(group = clap::ArgGroup::new("who").required(true), after_help = "\
 Examples:
   tandem eval --policy policies/student-push.safetensors
+  tandem eval --policy runs/NAME                # the best policy of a run
   tandem eval --policy FILE --episodes 400 --seed 7 --json
   tandem eval --policy policies/student-push.safetensors --baselines
   tandem eval --composed-teachers policies/teacher-push.safetensors
@@ -25,11 +26,11 @@ Examples:
       # in the environments of a server
   tandem eval --policy FILE --env-command 'tandem env'  # starts the server")]
 pub(crate) struct EvalArgs {
-    /// Policy to evaluate.
-    #[arg(long, value_name = "FILE", group = "who")]
+    /// Policy to evaluate: a file, or a run directory for the best policy of the run.
+    #[arg(long, value_name = "FILE|DIR", group = "who")]
     pub(crate) policy: Option<PathBuf>,
     /// One-arm policy that controls each arm separately: the baseline without a student.
-    #[arg(long, value_name = "FILE", group = "who")]
+    #[arg(long, value_name = "FILE|DIR", group = "who")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Also evaluates two baselines on the same goals: composed teachers, and the policy with arms that do not see each
     /// other.
@@ -42,7 +43,7 @@ pub(crate) struct EvalArgs {
         "baselines", "record", "record_dir", "film", "live", "env", "env_command"])]
     pub(crate) robustness: bool,
     /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
-    #[arg(long, value_name = "FILE", requires = "baselines")]
+    #[arg(long, value_name = "FILE|DIR", requires = "baselines")]
     pub(crate) teacher: Option<PathBuf>,
     /// Fails unless the policy is for this task, or composed teachers for its arms.
     #[arg(long, value_parser = TaskName::parser())]
@@ -127,7 +128,7 @@ Examples:
   tandem report trials/student-push --all-trials
   tandem report docs/results/students \\
       --composed-teachers policies/teacher-push.safetensors
-  tandem report runs/NAME --film-strips runs/NAME/policy/best.safetensors")]
+  tandem report runs/NAME --film-strips runs/NAME")]
 pub(crate) struct ReportArgs {
     /// Run directories, directories that contain runs or trials, or single metrics and trials files.
     #[arg(required = true, value_name = "DIR|FILE")]
@@ -147,10 +148,10 @@ pub(crate) struct ReportArgs {
     #[arg(long = "eval", value_name = "FILE.json")]
     pub(crate) evals: Vec<PathBuf>,
     /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
-    #[arg(long, value_name = "POLICY")]
+    #[arg(long, value_name = "FILE|DIR")]
     pub(crate) composed_teachers: Vec<PathBuf>,
-    /// Plays the test goals with this policy and shows a success and a failure as film strips; can be repeated.
-    #[arg(long, value_name = "POLICY")]
+    /// Plays the test goals with this policy, a file or a run directory, and shows a success and a failure as film strips; can be repeated.
+    #[arg(long, value_name = "FILE|DIR")]
     pub(crate) film_strips: Vec<PathBuf>,
     /// Draws all trials, not only failed ones.
     #[arg(long)]
@@ -230,11 +231,11 @@ Examples:
   tandem picture --composed-teachers policies/teacher-push.safetensors \\
       --step 20 --out arms.png")]
 pub(crate) struct PictureArgs {
-    /// Policy that controls the arms.
-    #[arg(long, value_name = "FILE", required_unless_present = "composed_teachers")]
+    /// Policy that controls the arms: a file or a run directory.
+    #[arg(long, value_name = "FILE|DIR", required_unless_present = "composed_teachers")]
     pub(crate) policy: Option<PathBuf>,
     /// One-arm policy that controls both arms.
-    #[arg(long, value_name = "FILE", conflicts_with = "policy")]
+    #[arg(long, value_name = "FILE|DIR", conflicts_with = "policy")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Seed of start and goal: those of the first episode of an evaluation with this seed.
     #[arg(long, default_value_t = TEST_SEED)]

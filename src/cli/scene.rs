@@ -37,10 +37,10 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE.json", group = "actor")]
     pub(crate) actions: Option<PathBuf>,
     /// Simulates the actions of this policy.
-    #[arg(long, value_name = "FILE", group = "actor")]
+    #[arg(long, value_name = "FILE|DIR", group = "actor")]
     pub(crate) policy: Option<PathBuf>,
     /// Simulates the actions of this one-arm policy, which controls each arm separately.
-    #[arg(long, value_name = "FILE", group = "actor")]
+    #[arg(long, value_name = "FILE|DIR", group = "actor")]
     pub(crate) composed_teachers: Option<PathBuf>,
     /// Prints one JSON object on one line [default: indented].
     #[arg(long)]

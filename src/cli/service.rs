@@ -68,9 +68,10 @@ Examples:
 
 docs/python-services.md shows how to serve a policy from Python.")]
 pub(crate) struct TeacherArgs {
-    /// Policy of the one-arm teacher: a policy file, the ONNX model of an actor (*.onnx), or http://HOST:PORT
-    /// (https:// with --tls-ca) of a server of tandem.v1.Policy, which is called with the token of --token-file.
-    #[arg(long, value_name = "FILE|URL")]
+    /// Policy of the one-arm teacher: a policy file, a run directory for the best policy of the run, the ONNX model of an
+    /// actor (*.onnx), or http://HOST:PORT (https:// with --tls-ca) of a server of tandem.v1.Policy, which is called with
+    /// the token of --token-file.
+    #[arg(long, value_name = "FILE|DIR|URL")]
     pub(crate) policy: PathBuf,
     /// Fails unless the policy has this digest, as `policy_digest` of `Describe` and `tandem policy show` give it.
     #[arg(long, value_name = "DIGEST")]

@@ -25,15 +25,14 @@ Examples:
   tandem train --task carry-bar  # two arms carry one bar
   tandem train --strategy ea --budget 50000 --seed 2 --max-minutes 20
   tandem train --strategy jsrl:20 --budget 10000
-  tandem train --teacher runs/NAME/policy/best.safetensors
+  tandem train --teacher runs/NAME  # its best policy
   tandem train --teacher actor.onnx --teacher-critic critic.onnx
   tandem train --teacher http://127.0.0.1:7005  # a policy in another process
   tandem train --set ddpg.discount=0.98 --set rounds.slots=16
   tandem train --arms 1 --recipe paper --print-run > my-run.toml
       # every setting of this run
   tandem train --run my-run.toml --out runs/mine --quiet
-  tandem train --recipe paper \\
-      --teacher runs/teacher-push-paper/policy/best.safetensors
+  tandem train --recipe paper --teacher runs/teacher-push-paper
   tandem train --env 127.0.0.1:7005  # plays in the environments of a server
   tandem train --env-command 'tandem env'
       # each worker starts a server of its own
@@ -62,10 +61,10 @@ pub(crate) struct TrainArgs {
     /// [default: none with one arm; mc-q:0.4 in pick-and-place of world shared with recipe tandem, else mc-q:0.1].
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
-    /// Policy file of the teacher, the ONNX model of an actor (*.onnx), or http://HOST:PORT of a server of
-    /// tandem.v1.Policy without a token [default: the shipped teacher of the task]. With --recipe paper it should be a
+    /// Policy file of the teacher, a run directory for the best policy of the run, the ONNX model of an actor (*.onnx),
+    /// or http://HOST:PORT of a server of tandem.v1.Policy without a token [default: the shipped teacher of the task]. With --recipe paper it should be a
     /// teacher of that recipe; otherwise a message says so.
-    #[arg(long, value_name = "FILE|URL")]
+    #[arg(long, value_name = "FILE|DIR|URL")]
     pub(crate) teacher: Option<PathBuf>,
     /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
     #[arg(long, value_name = "FILE.onnx", requires = "teacher")]

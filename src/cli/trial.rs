@@ -20,12 +20,12 @@ Examples:
   tandem report runs/trial-shared-push")]
 #[command(group = clap::ArgGroup::new("who").required(true).multiple(true))]
 pub(crate) struct TrialArgs {
-    /// Policy for both arms, reported under the name of its file or run directory; can be repeated.
-    #[arg(long = "policy", value_name = "FILE", group = "who")]
+    /// Policy for both arms, a file or a run directory, reported under its name; can be repeated.
+    #[arg(long = "policy", value_name = "FILE|DIR", group = "who")]
     pub(crate) policies: Vec<PathBuf>,
     /// One-arm policy that controls each arm separately, in the task of the other policies or of --task if it performs one
     /// arm's part of that; can be repeated.
-    #[arg(long, value_name = "FILE", group = "who")]
+    #[arg(long, value_name = "FILE|DIR", group = "who")]
     pub(crate) composed_teachers: Vec<PathBuf>,
     /// Fails unless the policies are for this task.
     #[arg(long, value_parser = TaskName::parser())]

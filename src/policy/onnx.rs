@@ -31,14 +31,15 @@ const TOLERANCE: f32 = 1e-4;
 type Encode = fn(&Policy) -> Result<Vec<u8>, tandem_policy::Error>;
 
 pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
-    let policy = policy_file::load(&args.file)?;
+    let file = policy_file::file_of(&args.file)?;
+    let policy = policy_file::load(&file)?;
     if args.critic_onnx.is_some() && !policy.has_critic() {
         let shown = args.file.display();
         return Err(Failed::usage(format!("--critic-onnx: {shown} has no critic")));
     }
     let outputs =
         [("--onnx", args.onnx.as_deref()), ("--critic-onnx", args.critic_onnx.as_deref())];
-    check_distinct(&[("FILE", Some(args.file.as_path())), outputs[0], outputs[1]])?;
+    check_distinct(&[("FILE", Some(&*file)), outputs[0], outputs[1]])?;
     let mut written = Vec::new();
     let networks: [(_, _, Encode); 2] =
         [("actor", &args.onnx, write::actor), ("critic", &args.critic_onnx, write::critic)];

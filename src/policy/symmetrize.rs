@@ -8,7 +8,8 @@ use crate::output::check_distinct;
 use crate::{output, policy_file};
 
 pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
-    let policy = policy_file::load(&args.file)?;
+    let file = policy_file::file_of(&args.file)?;
+    let policy = policy_file::load(&file)?;
     let refusal = if policy.is_symmetrized() {
         Some("the policy is symmetrised already".to_owned())
     } else if !policy.layout.has_interchangeable_arms() {
@@ -20,7 +21,7 @@ pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     if let Some(refusal) = refusal {
         return Err(Failed::usage(format!("{}: {refusal}", args.file.display())));
     }
-    check_distinct(&[("FILE", Some(args.file.as_path())), ("--out", Some(args.out.as_path()))])?;
+    check_distinct(&[("FILE", Some(&*file)), ("--out", Some(args.out.as_path()))])?;
     let mut policy = policy.symmetrized();
     // The evaluation was that of the policy before. Its seed remains: the goals chose this policy too.
     policy

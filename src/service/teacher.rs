@@ -11,7 +11,7 @@ use tandem_teacher::{Advisor, AnyPolicy, Error, PolicyTimeouts, RemoteError, Rem
 use super::{listen, run};
 use crate::cli::TeacherArgs;
 use crate::exit::{Exit, Failed};
-use crate::{access, metrics, signals};
+use crate::{access, metrics, policy_file, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
     let source = PolicySource::new(args.policy, args.critic)?;
@@ -62,6 +62,7 @@ impl PolicySource {
             Some(_) if critic.is_some() => Err(teacher_failed(Error::SurplusCritic)),
             Some(address) => Ok(Self::Server(address.to_owned())),
             None => {
+                let policy = policy_file::file_of(&policy)?.into_owned();
                 policy::load(&policy, critic.as_deref()).map_err(teacher_failed)?;
                 Ok(Self::File { policy, critic })
             }

@@ -17,7 +17,7 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
 use crate::service::worker_failed;
 use crate::shell::shell_word;
-use crate::{dashboard, output, run_directory, run_file, served_task};
+use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
 
 /// A run that can be started.
 pub(crate) struct Plan {
@@ -187,7 +187,7 @@ impl Plan {
     }
 
     pub(crate) fn best_policy(&self) -> PathBuf {
-        self.out.join("policy/best.safetensors")
+        self.out.join(policy_file::BEST)
     }
 
     /// Returns the directory of the checkpoints.

@@ -10,15 +10,15 @@ use tandem_system::atomic_file;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
-use crate::cli::{TrainArgs, task_flags};
+use crate::cli::{EnvironmentArgs, TrainArgs, task_flags};
 use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{advice_text, clock_text, grouped};
 use crate::run_pages::RunPages;
-use crate::shell::shell_word;
-use crate::{film, output, policy_file, run_directory, signals};
+use crate::shell::{shell_text, shell_word};
+use crate::{environment_server, film, output, policy_file, run_directory, signals};
 
 /// File in the run directory.
 const FILE: &str = "summary.json";
@@ -151,43 +151,52 @@ fn summary_lines(
         format!("state digest  {}", last.digest),
         "next".to_owned(),
     ]);
-    lines.extend(next_commands(plan).iter().map(|command| command_line(command)));
+    lines.extend(next_commands(plan).iter().map(command_line));
     lines
 }
 
-/// Returns commands that use the result: evaluate it, look at it, use it elsewhere, train longer.
-fn next_commands(plan: &Plan) -> Vec<String> {
+/// Returns commands that use the result: evaluate it, look at it, use it elsewhere, train longer. A command consists of
+/// its beginning and its last option, which may be on another line.
+fn next_commands(plan: &Plan) -> Vec<(String, Option<String>)> {
     let (out, policy) = (shell_word(&plan.out), shell_word(&plan.best_policy()));
-    let mut commands = Vec::new();
     let is_simulated = !names_server(&plan.environment);
-    if is_simulated {
-        let baselines = if plan.config.arms == 2 { " --baselines" } else { "" };
-        commands.push(format!("tandem eval --policy {policy}{baselines}"));
-    }
+    let evaluate = format!("tandem eval --policy {policy}");
+    let mut commands = vec![match is_simulated {
+        true => (evaluate, (plan.config.arms == 2).then(|| "--baselines".to_owned())),
+        false => (evaluate, Some(server_options(&plan.environment))),
+    }];
     if plan.config.arms == 1 && is_simulated {
         let task = plan.config.task.parse().map_or_else(|_unknown| String::new(), task_flags);
-        commands.push(format!("tandem train {task} --teacher {policy}"));
+        commands.push((format!("tandem train {task}"), Some(format!("--teacher {policy}"))));
     }
-    commands.extend(newest_log(&plan.out).map(|log| format!("tandem replay {}", shell_word(&log))));
-    commands.push(format!("tandem policy export {policy} --onnx actor.onnx"));
+    let log = newest_log(&plan.out);
+    commands.extend(log.map(|log| (format!("tandem replay {}", shell_word(&log)), None)));
+    commands.push((format!("tandem policy export {policy}"), Some("--onnx actor.onnx".to_owned())));
     if plan.config.stop.max_env_steps > 0 {
         let longer = 2 * plan.config.stop.max_env_steps;
         let minutes = if plan.config.stop.max_minutes > 0.0 { " --max-minutes 0" } else { "" };
         let success = if plan.config.stop.until_success > 0.0 { " --until-success 0" } else { "" };
-        let limits = format!("--max-env-steps {longer}{minutes}{success}");
-        commands.push(format!("tandem train --resume --out {out} {limits}"));
+        commands.push((
+            format!("tandem train --resume --out {out}"),
+            Some(format!("--max-env-steps {longer}{minutes}{success}")),
+        ));
     }
     commands
 }
 
-/// Indents a command, and continues it on a second line if it is too long for a terminal.
-fn command_line(command: &str) -> String {
-    let line = format!("  {command}");
-    match line.rsplit_once(" --") {
-        Some((start, option)) if line.chars().count() > N_COLUMNS => {
-            format!("{start} \\\n      --{option}")
-        }
-        _ => line,
+/// Returns the options of a server of environments for a shell.
+fn server_options(environment: &EnvironmentArgs) -> String {
+    let words = environment_server::arguments(environment);
+    let words = words.into_iter().map(|word| shell_text(word.to_string_lossy().into_owned()));
+    words.collect::<Vec<_>>().join(" ")
+}
+
+/// Indents a command, and puts its last option on a second line if it is too long for a terminal.
+fn command_line((start, option): &(String, Option<String>)) -> String {
+    let Some(option) = option else { return format!("  {start}") };
+    match format!("  {start} {option}") {
+        line if line.chars().count() > N_COLUMNS => format!("  {start} \\\n      {option}"),
+        line => line,
     }
 }
 
@@ -245,4 +254,32 @@ fn summary_json(
         summary.extend(more);
     }
     summary
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_for_served_environments_names_the_server_and_is_not_broken_within_a_word() {
+        let command = "python -m tandem.serve FetchPush-v4 --seed 1 --reward sparse".to_owned();
+        let environment =
+            EnvironmentArgs { env_command: Some(command), ..EnvironmentArgs::default() };
+        let option = server_options(&environment);
+        let line = command_line(&("tandem eval --policy p".to_owned(), Some(option)));
+        assert_eq!(
+            line,
+            "  tandem eval --policy p \\\n      --env-command 'python -m tandem.serve FetchPush-v4 \
+             --seed 1 --reward sparse'"
+        );
+        let environment = EnvironmentArgs {
+            env: Some("127.0.0.1:7005".to_owned()),
+            env_token_file: Some("a token".into()),
+            ..EnvironmentArgs::default()
+        };
+        let option = server_options(&environment);
+        assert_eq!(option, "--env 127.0.0.1:7005 --env-token-file 'a token'");
+        let short = command_line(&("tandem eval".to_owned(), Some(option)));
+        assert_eq!(short, "  tandem eval --env 127.0.0.1:7005 --env-token-file 'a token'");
+    }
 }

@@ -72,6 +72,7 @@ impl TeacherFile {
         if let Some(address) = policy_address(&path) {
             return ServedPolicy::of(address).map(Self::served);
         }
+        let path = policy_file::file_of(&path)?.into_owned();
         let policy = policy_file::load(&path)?;
         let (digest, layout) = (policy.digest(), policy.layout.clone());
         let (has_values, source) = (policy.has_critic(), Source::Policy(policy));

@@ -118,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 104] = [
+const CASES: [(&str, i32, &str); 106] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -159,7 +159,9 @@ const CASES: [(&str, i32, &str); 104] = [
         "--onnx is the same file",
     ),
     ("eval --policy @missing", 65, "missing"),
-    ("eval --policy @folder", 65, "folder"),
+    ("eval --policy @folder", 65, "folder is a directory without policy/best.safetensors"),
+    ("train --teacher @runs/half", 65, "without policy/best.safetensors"),
+    ("teacher --ledger memory --policy @runs/half", 65, "without policy/best.safetensors"),
     ("eval --policy @empty", 65, "empty"),
     ("eval --policy @garbage", 65, "garbage"),
     ("eval --policy @altered", 65, "digest"),
