@@ -4,14 +4,14 @@ use std::path::Path;
 
 use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::{Episode, Layout, TaskSpec, WorldSettings};
-use tandem_picture::{Film, FilmEpisode, FilmStep, film_gif, film_strip};
+use tandem_picture::{Film, FilmEpisode, FilmStep, film_gif_with, film_strip};
 use tandem_report::FilmStrip;
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_system::atomic_file;
 
 use crate::cli::FilmArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::output;
+use crate::{output, run_display};
 
 /// Width and height of a picture in an animation, pixels.
 const ANIMATION_SIZE: (usize, usize) = (640, 400);
@@ -58,12 +58,23 @@ impl<'a> PlannedFilm<'a> {
     /// Draws the film and writes its file.
     pub(crate) fn write(&self, episodes: &[FilmEpisode]) -> Result<(), Failed> {
         let bytes = match self.kind {
-            Kind::Animation => film_gif(episodes, &self.film),
+            Kind::Animation => self.animation(episodes),
             Kind::Strip => film_strip(episodes, &self.film),
         };
         let bytes = bytes.or_exit(Exit::Bug, String::new)?;
         atomic_file::replace_target(self.path, &bytes)
             .or_cannot_write(|| format!("cannot write {}", self.path.display()))
+    }
+
+    /// Draws an animation, which takes some seconds, with a progress bar on a terminal.
+    fn animation(&self, episodes: &[FilmEpisode]) -> Result<Vec<u8>, tandem_picture::Error> {
+        let bar = run_display::bar("film");
+        let drawn = film_gif_with(episodes, &self.film, |n_frames, n_all| {
+            bar.set_length(n_all as u64);
+            bar.set_position(n_frames as u64);
+        });
+        bar.finish_and_clear();
+        drawn
     }
 }
 

@@ -126,6 +126,16 @@ impl Live {
     }
 }
 
+/// Returns a bar for work with steps, on a terminal only.
+pub(crate) fn bar(what: &str) -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let bar = ProgressBar::new(0).with_message(what.to_owned());
+    bar.set_style(style("{spinner} {msg} [{wide_bar}] {percent:>3} %"));
+    bar
+}
+
 fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template)
         .unwrap_or_else(|_| ProgressStyle::default_bar())

@@ -86,8 +86,8 @@ pub(crate) struct Camera {
 
 /// A part of the picture, pixels from the upper left corner.
 pub(crate) struct Rectangle {
-    low: [f64; 2],
-    high: [f64; 2],
+    pub(crate) low: [f64; 2],
+    pub(crate) high: [f64; 2],
 }
 
 impl Rectangle {
@@ -155,8 +155,17 @@ impl Camera {
         (self.eye, direction.normalize())
     }
 
+    /// Returns a part of the picture that contains all points within `radius_m` of a segment.
+    pub(crate) fn bounds(&self, ends: [DVec3; 2], radius_m: f64) -> Rectangle {
+        let [one, other] = ends.map(|end| self.bounds_of_sphere(end, radius_m));
+        Rectangle {
+            low: [0, 1].map(|axis| one.low[axis].min(other.low[axis])),
+            high: [0, 1].map(|axis| one.high[axis].max(other.high[axis])),
+        }
+    }
+
     /// Returns a part of the picture that contains all of a sphere.
-    pub(crate) fn bounds(&self, centre: DVec3, radius_m: f64) -> Rectangle {
+    fn bounds_of_sphere(&self, centre: DVec3, radius_m: f64) -> Rectangle {
         let nearest_m = (centre - self.eye).dot(self.forward) - radius_m;
         if nearest_m < NEAREST_M {
             return Rectangle { low: [f64::NEG_INFINITY; 2], high: [f64::INFINITY; 2] };

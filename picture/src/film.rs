@@ -5,9 +5,11 @@ use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::reward::distance;
 use tandem_core::scene::{Point, Scene};
 
+use crate::camera::View;
 use crate::caption::{self, BAD, Corner, GOOD, INK};
 use crate::error::Error;
 use crate::interpolate::between;
+use crate::motion::motion_m;
 use crate::painter::render_achieved;
 use crate::palette::{Palette, UNCHANGED};
 use crate::raster::Raster;
@@ -21,7 +23,10 @@ const LAST_CS: u16 = 90;
 const REST_M: f32 = 0.01;
 /// Number of control steps at rest at the end of an episode that are shown.
 const N_RESTING: usize = 3;
-/// Frames that are in memory at a time.
+/// Motion since an earlier frame up to which a frame shows the bodies as that did, pixels.
+const STILL_PX: f64 = 0.25;
+/// Maximum number of frames that show the bodies of one frame, and of such groups of frames in memory at a time.
+const MAX_STILL: usize = 8;
 const CHUNK: usize = 16;
 /// Smallest and largest width and height of a picture, pixels.
 const SIZES_PX: std::ops::RangeInclusive<usize> = 64..=4096;
@@ -115,6 +120,18 @@ struct Shot<'a> {
 /// # Errors
 /// If there is no scene, or `film` is out of range.
 pub fn film_gif(episodes: &[FilmEpisode], film: &Film) -> Result<Vec<u8>, Error> {
+    film_gif_with(episodes, film, |_, _| {})
+}
+
+/// Returns a film as [`film_gif`], and calls `on_progress` with the number of frames so far and of all frames.
+///
+/// # Errors
+/// If there is no scene, or `film` is out of range.
+pub fn film_gif_with(
+    episodes: &[FilmEpisode],
+    film: &Film,
+    mut on_progress: impl FnMut(usize, usize),
+) -> Result<Vec<u8>, Error> {
     let film = film.checked()?;
     let shots: Vec<Shot<'_>> =
         episodes.iter().flat_map(|episode| shots(episode, film.speed)).collect();
@@ -128,14 +145,17 @@ pub fn film_gif(episodes: &[FilmEpisode], film: &Film) -> Result<Vec<u8>, Error>
     let mut encoder = Encoder::new(&mut bytes, width, height, &palette.rgb)?;
     encoder.set_repeat(Repeat::Infinite)?;
     let mut shown: Option<Vec<u8>> = None;
-    for chunk in shots.chunks(CHUNK) {
-        let drawn: Vec<Vec<u8>> =
-            chunk.par_iter().map(|shot| palette.indices(&shot.draw(&film))).collect();
-        for (shot, indices) in chunk.iter().zip(drawn) {
+    let mut n_written = 0;
+    for chunk in still_groups(&shots, &film).chunks(CHUNK) {
+        let drawn: Vec<Vec<Vec<u8>>> =
+            chunk.par_iter().map(|group| draw_group(group, &film, &palette)).collect();
+        for (shot, indices) in chunk.iter().copied().flatten().zip(drawn.into_iter().flatten()) {
             let mut frame = changed_part(shown.as_deref(), &indices, film.width);
             frame.delay = shot.delay_cs;
             encoder.write_frame(&frame)?;
             shown = Some(indices);
+            n_written += 1;
+            on_progress(n_written, shots.len());
         }
     }
     drop(encoder);
@@ -172,12 +192,49 @@ fn shots(episode: &FilmEpisode, speed: f64) -> Vec<Shot<'_>> {
     shots
 }
 
+/// Divides frames into groups in which nothing moves visibly since the first of the group.
+fn still_groups<'a, 'b>(shots: &'a [Shot<'b>], film: &Film) -> Vec<&'a [Shot<'b>]> {
+    let mut groups = Vec::new();
+    let mut rest = shots;
+    while let Some(first) = rest.first() {
+        let first = first.step();
+        let view = View::of(&first.scene, film.width, film.height);
+        let is_still = |shot: &&Shot<'_>| {
+            let step = shot.step();
+            let motion_px =
+                f64::from(motion_m(&first.scene, &step.scene)) * view.pixels_per_m([0.0; 3]);
+            let is_same = step.achieved == first.achieved && step.scene.goals == first.scene.goals;
+            is_same && motion_px < STILL_PX
+        };
+        let n_still = rest.iter().take(MAX_STILL).take_while(is_still).count();
+        let (group, after) = rest.split_at(n_still.max(1));
+        groups.push(group);
+        rest = after;
+    }
+    groups
+}
+
+/// Draws the frames of a group: the bodies of the first, and the captions of each.
+fn draw_group(group: &[Shot<'_>], film: &Film, palette: &Palette) -> Vec<Vec<u8>> {
+    let Some(first) = group.first() else { return Vec::new() };
+    let bodies = draw_bodies(&first.step(), (film.width, film.height));
+    let frames = group.iter().map(|shot| {
+        let mut raster = bodies.clone();
+        write_captions(&mut raster, shot.title, &shot.step(), shot.is_last);
+        palette.indices(&raster)
+    });
+    frames.collect()
+}
+
 impl Shot<'_> {
     fn draw(&self, film: &Film) -> Raster {
+        draw_step(self.title, &self.step(), self.is_last, (film.width, film.height))
+    }
+
+    fn step(&self) -> FilmStep {
         let scene = between(&self.before.scene, &self.after.scene, self.share);
         // Whether a goal is achieved is known at control steps.
-        let step = FilmStep { scene, achieved: self.before.achieved.clone() };
-        draw_step(self.title, &step, self.is_last, (film.width, film.height))
+        FilmStep { scene, achieved: self.before.achieved.clone() }
     }
 }
 
@@ -188,8 +245,17 @@ pub(crate) fn draw_step(
     is_last: bool,
     size: (usize, usize),
 ) -> Raster {
-    let mut raster = render_achieved(&step.scene, &step.achieved, size.0, size.1);
-    caption::write(&mut raster, (Corner::Left, 0), title, INK);
+    let mut raster = draw_bodies(step, size);
+    write_captions(&mut raster, title, step, is_last);
+    raster
+}
+
+fn draw_bodies(step: &FilmStep, size: (usize, usize)) -> Raster {
+    render_achieved(&step.scene, &step.achieved, size.0, size.1)
+}
+
+fn write_captions(raster: &mut Raster, title: &str, step: &FilmStep, is_last: bool) {
+    caption::write(raster, (Corner::Left, 0), title, INK);
     let is_success = !step.achieved.is_empty() && step.achieved.iter().all(|achieved| *achieved);
     let time = format!("{:.2} s", step.scene.time_s);
     let (result, color) = match (is_success, is_last) {
@@ -197,9 +263,8 @@ pub(crate) fn draw_step(
         (false, true) => ("failure", BAD),
         (false, false) => ("", INK),
     };
-    caption::write(&mut raster, (Corner::Right, 0), &time, INK);
-    caption::write(&mut raster, (Corner::Right, 1), result, color);
-    raster
+    caption::write(raster, (Corner::Right, 0), &time, INK);
+    caption::write(raster, (Corner::Right, 1), result, color);
 }
 
 /// Returns the smallest frame that changes the picture from `shown` to `indices`, both of shape `[height, width]`.

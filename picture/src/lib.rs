@@ -14,6 +14,8 @@ mod error;
 #[cfg(feature = "files")]
 mod film;
 mod interpolate;
+#[cfg(feature = "files")]
+mod motion;
 mod painter;
 #[cfg(feature = "files")]
 mod palette;
@@ -21,6 +23,7 @@ mod raster;
 mod shape;
 #[cfg(feature = "files")]
 mod strip;
+mod tiles;
 
 #[cfg(all(test, feature = "files"))]
 mod tests;
@@ -29,7 +32,7 @@ pub use camera::View;
 #[cfg(feature = "files")]
 pub use error::Error;
 #[cfg(feature = "files")]
-pub use film::{Film, FilmEpisode, FilmStep, film_gif};
+pub use film::{Film, FilmEpisode, FilmStep, film_gif, film_gif_with};
 pub use interpolate::between;
 pub use painter::render;
 pub use raster::Raster;

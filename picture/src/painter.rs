@@ -9,6 +9,7 @@ use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 use crate::camera::{Camera, Rectangle, table_z_m};
 use crate::raster::Raster;
 use crate::shape::{Hit, Shape};
+use crate::tiles::{Tile, Tiles};
 
 /// Red, green and blue, 0 to 255.
 type Rgb = DVec3;
@@ -35,6 +36,8 @@ const LIGHT: DVec3 = DVec3::new(-0.36, -0.48, 0.80);
 const LIGHT_RADIUS: f64 = 0.028;
 /// Number of points of the light that a shadow on the table is computed from.
 const N_LIGHT_POINTS: u8 = 7;
+/// Allowance for the longer ways of rays from points beside the centre of the light.
+const SOFT_WIDENING: f64 = 1.2;
 /// Brightness of a surface in shadow relative to the same surface in light.
 const SHADOW: f64 = 0.80;
 /// Opacity of goals, and of goals that are achieved.
@@ -52,6 +55,8 @@ const JOINT_WIDENING: f64 = 1.12;
 const N_SAMPLES: usize = 3;
 /// Distance from a surface at which the rays of its shadow start, metres.
 const SHADOW_OFFSET_M: f64 = 1e-4;
+/// Allowance for rounding and [`SHADOW_OFFSET_M`] when bodies are chosen whose shadows may fall on another, metres.
+const BLOCKER_MARGIN_M: f64 = 1e-3;
 /// Index of the table among the bodies.
 const TABLE: usize = 0;
 
@@ -69,18 +74,23 @@ pub(crate) fn render_achieved(
     height: usize,
 ) -> Raster {
     let painter = Painter::new(scene, achieved, width, height);
-    let bodies: Vec<Sample> =
-        pixels(width, height).map(|(x, y)| painter.sample(centre(x), centre(y))).collect();
     let mut rgb = Vec::with_capacity(3 * width * height);
+    let mut surfaces = Vec::with_capacity(width * height);
     for (x, y) in pixels(width, height) {
-        let here = &bodies[y * width + x];
+        let sample = painter.sample(painter.tiles.at(x, y), centre(x), centre(y));
+        rgb.extend(sample.color.to_array().map(to_u8));
+        surfaces.push(sample.surface.packed());
+    }
+    for (x, y) in pixels(width, height) {
+        let idx = y * width + x;
         let (right, below) = ((x + 1).min(width - 1), (y + 1).min(height - 1));
         let (left, above) = (x.saturating_sub(1), y.saturating_sub(1));
         let neighbours =
             [y * width + right, y * width + left, below * width + x, above * width + x];
-        let is_edge = neighbours.iter().any(|idx| bodies[*idx].surface != here.surface);
-        let color = if is_edge { painter.smooth(x, y) } else { here.color };
-        rgb.extend(color.to_array().map(to_u8));
+        if neighbours.iter().any(|neighbour| surfaces[*neighbour] != surfaces[idx]) {
+            let color = painter.smooth(x, y).to_array().map(to_u8);
+            rgb[3 * idx..3 * idx + 3].copy_from_slice(&color);
+        }
     }
     Raster { width, height, rgb }
 }
@@ -101,7 +111,7 @@ fn centre(pixel: usize) -> f64 {
     reason = "clamped to 0..=255 first"
 )]
 fn to_u8(value: f64) -> u8 {
-    value.round().clamp(0.0, 255.0) as u8
+    (value.clamp(0.0, 255.0) + 0.5) as u8
 }
 
 /// A body with its colour and the part of the picture that contains it.
@@ -126,31 +136,59 @@ struct Sample {
 }
 
 /// What distinguishes the surfaces between which edges are smoothed.
-#[derive(PartialEq, Clone, Copy)]
+#[derive(Clone, Copy)]
 struct Surface {
-    body: Option<usize>,
+    body: Option<u16>,
     /// Number of points of the light that reach the surface.
     n_lit: u8,
-    /// The normal in steps of a quarter, so that the faces of a box differ and those of a cylinder mostly do not.
-    face: [i8; 3],
+    /// The normal in steps of a half, so that the faces of a box differ and those of a cylinder mostly do not: a digit
+    /// from 0 to 4 for each component.
+    face: u8,
     /// A bit for each goal in front of the surface or around it on the table.
     goals: u32,
 }
 
-/// The part of the table on which a body may cast a shadow: a disc.
+impl Surface {
+    /// Returns a number that is the same for equal surfaces only.
+    fn packed(self) -> u64 {
+        let body = self.body.map_or(0, |body| 1 + u64::from(body));
+        (body << 47)
+            | (u64::from(self.n_lit) << 40)
+            | (u64::from(self.face) << 32)
+            | u64::from(self.goals)
+    }
+}
+
+/// The part of the table on which a body may cast a shadow: the points near a segment.
 struct ShadowBounds {
     body_idx: usize,
-    centre: DVec2,
+    from: DVec2,
+    to: DVec2,
     radius_m: f64,
+    /// The part of the picture that contains them.
+    bounds: Rectangle,
+}
+
+impl ShadowBounds {
+    fn contains(&self, place: DVec2) -> bool {
+        let (axis, offset) = (self.to - self.from, place - self.from);
+        let length_m2 = axis.length_squared();
+        let share =
+            if length_m2 > 0.0 { (offset.dot(axis) / length_m2).clamp(0.0, 1.0) } else { 0.0 };
+        (offset - share * axis).length_squared() < self.radius_m * self.radius_m
+    }
 }
 
 struct Painter {
     camera: Camera,
     bodies: Vec<Body>,
+    /// For each body, the bodies other than the table whose shadows may fall on it.
+    blockers: Vec<Vec<usize>>,
     shadows: Vec<ShadowBounds>,
     /// Directions towards points of the light, unit vectors.
     light_points: [DVec3; N_LIGHT_POINTS as usize],
     goals: Vec<Goal>,
+    tiles: Tiles,
     table_z_m: f64,
     tolerance_m: f64,
 }
@@ -159,17 +197,16 @@ impl Painter {
     fn new(scene: &Scene, achieved: &[bool], width: usize, height: usize) -> Self {
         let table_z_m = table_z_m(scene);
         let camera = Camera::fitted(&scene.arms, table_z_m, width, height);
-        let body = |(shape, color): (Shape, Rgb)| Body {
-            bounds: camera.bounds(shape.centre, shape.radius_m),
-            shape,
-            color,
+        let body = |(shape, color): (Shape, Rgb)| {
+            let (ends, radius_m) = shape.extent();
+            Body { bounds: camera.bounds(ends, radius_m), shape, color }
         };
         let tolerance_m = f64::from(scene.goal_tolerance_m);
         let achieved = achieved.iter().copied().chain(std::iter::repeat(false));
         let goal = |((position, color), is_achieved): ((&[f32; 3], &Rgb), bool)| {
             let position = DVec3::from(position.map(f64::from));
             let shape = Shape::sphere(position, tolerance_m);
-            let bounds = camera.bounds(position, tolerance_m);
+            let bounds = camera.bounds([position; 2], tolerance_m);
             Goal { bounds, shape, position, color: *color, is_achieved }
         };
         let colors = || ARM_COLORS.iter().cycle();
@@ -180,11 +217,19 @@ impl Painter {
         let table = (Shape::cuboid(&scene.table), TABLE_COLOR);
         let bodies: Vec<Body> =
             std::iter::once(table).chain(arms).chain(objects).map(body).collect();
+        let goals: Vec<Goal> = scene.goals.iter().zip(colors()).zip(achieved).map(goal).collect();
+        let shadows = shadow_bounds(&bodies, &camera, table_z_m);
+        let mut tiles = Tiles::new(width, height);
+        tiles.add(bodies.iter().map(|body| &body.bounds), |tile| &mut tile.bodies);
+        tiles.add(shadows.iter().map(|shadow| &shadow.bounds), |tile| &mut tile.shadows);
+        tiles.add(goals.iter().map(|goal| &goal.bounds), |tile| &mut tile.goals);
         Self {
-            shadows: shadow_bounds(&bodies, table_z_m),
+            shadows,
             light_points: light_points(),
+            blockers: bodies.iter().map(|body| blockers_of(body, &bodies)).collect(),
             bodies,
-            goals: scene.goals.iter().zip(colors()).zip(achieved).map(goal).collect(),
+            goals,
+            tiles,
             camera,
             table_z_m,
             tolerance_m,
@@ -194,24 +239,26 @@ impl Painter {
     /// Returns the mean colour of a pixel at the edge of a surface.
     fn smooth(&self, x: usize, y: usize) -> Rgb {
         let offset = |sample| (centre(sample)) / (centre(N_SAMPLES) - 0.5) - 0.5;
+        let tile = self.tiles.at(x, y);
         let samples = pixels(N_SAMPLES, N_SAMPLES)
-            .map(|(i, j)| self.sample(centre(x) + offset(i), centre(y) + offset(j)).color);
+            .map(|(i, j)| self.sample(tile, centre(x) + offset(i), centre(y) + offset(j)).color);
         samples.sum::<Rgb>() / (centre(N_SAMPLES * N_SAMPLES) - 0.5)
     }
 
-    /// Returns the colour at a place in the picture, pixels from the upper left corner.
-    fn sample(&self, x: f64, y: f64) -> Sample {
+    /// Returns the colour at a place in `tile`, pixels from the upper left corner of the picture.
+    fn sample(&self, tile: &Tile, x: f64, y: f64) -> Sample {
         let (origin, direction) = self.camera.ray(x, y);
-        let hit = self.nearest(x, y, origin, direction);
+        let hit = self.nearest(tile, (x, y), origin, direction);
         let depth_m = hit.as_ref().map_or(f64::INFINITY, |(_, hit)| hit.distance_m);
         let (mut color, mut surface) = match &hit {
             Some((idx, hit)) => {
-                self.shade(*idx, hit, origin + hit.distance_m * direction, direction)
+                let point = origin + hit.distance_m * direction;
+                self.shade(*idx, hit, (point, direction), &tile.shadows)
             }
-            None => (BACKGROUND, Surface { body: None, n_lit: 0, face: [0; 3], goals: 0 }),
+            None => (BACKGROUND, Surface { body: None, n_lit: 0, face: 0, goals: 0 }),
         };
-        for (idx, goal) in self.goals.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y))
-        {
+        let goals = tile.goals.iter().map(|idx| (*idx, &self.goals[*idx]));
+        for (idx, goal) in goals.filter(|(_, it)| it.bounds.contains(x, y)) {
             let front = goal.shape.hit(origin, direction).filter(|it| it.distance_m < depth_m);
             if let Some(front) = front {
                 let rim = 1.0 - front.normal.dot(direction).abs();
@@ -225,17 +272,31 @@ impl Painter {
     }
 
     /// Returns the first body that a ray through pixel (`x`, `y`) meets, and where.
-    fn nearest(&self, x: f64, y: f64, origin: DVec3, direction: DVec3) -> Option<(usize, Hit)> {
-        let candidates = self.bodies.iter().enumerate().filter(|(_, it)| it.bounds.contains(x, y));
+    fn nearest(
+        &self,
+        tile: &Tile,
+        (x, y): (f64, f64),
+        origin: DVec3,
+        direction: DVec3,
+    ) -> Option<(usize, Hit)> {
+        let bodies = tile.bodies.iter().map(|idx| (*idx, &self.bodies[*idx]));
+        let candidates = bodies.filter(|(_, it)| it.bounds.contains(x, y));
         let hits =
             candidates.filter_map(|(idx, body)| Some((idx, body.shape.hit(origin, direction)?)));
         hits.min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))
     }
 
-    /// Returns the colour of body `idx` where `hit` is, seen along the unit vector `direction`.
-    fn shade(&self, idx: usize, hit: &Hit, point: DVec3, direction: DVec3) -> (Rgb, Surface) {
+    /// Returns the colour of body `idx` at `point`, where `hit` is, seen along the unit vector `direction`. `shadows` are
+    /// those that may fall on the table there.
+    fn shade(
+        &self,
+        idx: usize,
+        hit: &Hit,
+        (point, direction): (DVec3, DVec3),
+        shadows: &[usize],
+    ) -> (Rgb, Surface) {
         let normal = hit.normal;
-        let (facing, n_lit) = (normal.dot(LIGHT).max(0.0), self.n_lit(idx, hit, point));
+        let (facing, n_lit) = (normal.dot(LIGHT).max(0.0), self.n_lit(idx, hit, point, shadows));
         let brightness = 0.60 + 0.07 * normal.z + 0.46 * facing;
         let mut color = lit(self.bodies[idx].color, brightness);
         let mut goals = 0;
@@ -260,24 +321,23 @@ impl Painter {
                 color = color.lerp(WHITE, HIGHLIGHT * share * highlight);
             }
         }
-        (color, Surface { body: Some(idx), n_lit, face: face(normal), goals })
+        (color, Surface { body: u16::try_from(idx).ok(), n_lit, face: face(normal), goals })
     }
 
     /// Returns how many points of the light reach the surface at `point`. Only shadows on the table have a soft edge.
-    fn n_lit(&self, idx: usize, hit: &Hit, point: DVec3) -> u8 {
+    fn n_lit(&self, idx: usize, hit: &Hit, point: DVec3, shadows: &[usize]) -> u8 {
         if hit.normal.dot(LIGHT) <= 0.0 {
             return 0;
         }
         let start = point + SHADOW_OFFSET_M * hit.normal;
         if idx != TABLE || hit.normal.z < 0.5 {
-            let is_blocked = |body: &Body| body.shape.hit(start, LIGHT).is_some();
-            return N_LIGHT_POINTS * u8::from(!self.bodies[1..].iter().any(is_blocked));
+            let is_blocked = |idx: &usize| self.bodies[*idx].shape.hit(start, LIGHT).is_some();
+            return N_LIGHT_POINTS * u8::from(!self.blockers[idx].iter().any(is_blocked));
         }
         let place = point.truncate();
-        let near =
-            |it: &&ShadowBounds| it.centre.distance_squared(place) < it.radius_m * it.radius_m;
+        let near = |it: &&ShadowBounds| it.contains(place);
         let mut is_free = [true; N_LIGHT_POINTS as usize];
-        for bounds in self.shadows.iter().filter(near) {
+        for bounds in shadows.iter().map(|idx| &self.shadows[*idx]).filter(near) {
             let shape = &self.bodies[bounds.body_idx].shape;
             for (is_free, light) in is_free.iter_mut().zip(self.light_points) {
                 *is_free = *is_free && shape.hit(start, light).is_none();
@@ -288,18 +348,30 @@ impl Painter {
 }
 
 /// Returns the parts of the table on which the bodies other than the table may cast shadows.
-fn shadow_bounds(bodies: &[Body], table_z_m: f64) -> Vec<ShadowBounds> {
+fn shadow_bounds(bodies: &[Body], camera: &Camera, table_z_m: f64) -> Vec<ShadowBounds> {
     let bounds = |(body_idx, body): (usize, &Body)| {
-        let Shape { centre, radius_m, .. } = body.shape;
-        let distance_m = (centre.z - table_z_m) / LIGHT.z;
-        let soft_m = LIGHT_RADIUS * distance_m.abs();
-        ShadowBounds {
-            body_idx,
-            centre: (centre - distance_m * LIGHT).truncate(),
-            radius_m: (radius_m + soft_m) / LIGHT.z,
-        }
+        let (ends, radius_m) = body.shape.extent();
+        let distances_m = ends.map(|end| (end.z - table_z_m) / LIGHT.z);
+        let soft_m = SOFT_WIDENING * LIGHT_RADIUS * distances_m[0].abs().max(distances_m[1].abs());
+        let radius_m = (radius_m + soft_m) / LIGHT.z;
+        let shadow = |idx: usize| ends[idx] - distances_m[idx] * LIGHT;
+        let ends = [shadow(0), shadow(1)];
+        let [from, to] = ends.map(DVec3::truncate);
+        ShadowBounds { body_idx, from, to, radius_m, bounds: camera.bounds(ends, radius_m) }
     };
     bodies.iter().enumerate().skip(1).map(bounds).collect()
+}
+
+/// Returns the indices of the bodies other than the table whose shadows may fall on `body`.
+fn blockers_of(body: &Body, bodies: &[Body]) -> Vec<usize> {
+    let may_block = |other: &Body| {
+        let offset = other.shape.centre - body.shape.centre;
+        let along_m = offset.dot(LIGHT);
+        let radius_m = body.shape.radius_m + other.shape.radius_m + BLOCKER_MARGIN_M;
+        along_m >= -radius_m && (offset - along_m * LIGHT).length() <= radius_m
+    };
+    let others = bodies.iter().enumerate().skip(1);
+    others.filter(|(_, other)| may_block(other)).map(|(idx, _)| idx).collect()
 }
 
 /// Returns directions towards points of the light: its centre, and a ring around it.
@@ -316,9 +388,13 @@ fn light_points() -> [DVec3; N_LIGHT_POINTS as usize] {
     })
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "a unit vector, so from −2 to 2")]
-fn face(normal: DVec3) -> [i8; 3] {
-    (2.0 * normal).round().to_array().map(|component| component as i8)
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a unit vector, so from 0 to 4"
+)]
+fn face(normal: DVec3) -> u8 {
+    (2.0 * normal + 2.5).to_array().into_iter().fold(0, |face, digit| 5 * face + digit as u8)
 }
 
 /// Changes the brightness of a colour: 0 is black, 1 the colour itself, 2 white.
@@ -345,4 +421,44 @@ fn shapes_of(arm: &ArmScene, color: Rgb) -> Vec<(Shape, Rgb)> {
     let hand = arm.hand.iter().map(|part| (Shape::cuboid(part), HAND_COLOR));
     let pedestal = std::iter::once((Shape::cuboid(&pedestal), PEDESTAL_COLOR));
     pedestal.chain(bars).chain(joints).chain(hand).collect()
+}
+
+#[cfg(all(test, feature = "files"))]
+mod tests {
+    use super::*;
+
+    impl Painter {
+        /// Draws as if everything could be seen everywhere.
+        fn without_bounds(mut self) -> (Self, Tile) {
+            let n_bodies = self.bodies.len();
+            let everywhere = || Rectangle { low: [f64::MIN; 2], high: [f64::MAX; 2] };
+            self.bodies.iter_mut().for_each(|body| body.bounds = everywhere());
+            self.goals.iter_mut().for_each(|goal| goal.bounds = everywhere());
+            self.shadows.iter_mut().for_each(|shadow| shadow.radius_m = f64::INFINITY);
+            self.blockers = vec![(1..n_bodies).collect(); n_bodies];
+            let tile = Tile {
+                bodies: (0..n_bodies).collect(),
+                shadows: (0..self.shadows.len()).collect(),
+                goals: (0..self.goals.len()).collect(),
+            };
+            (self, tile)
+        }
+    }
+
+    #[test]
+    fn tiles_and_bounds_leave_out_nothing_that_can_be_seen() {
+        for (scene, (width, height)) in [
+            (crate::tests::scene(0.0, -0.2), (200, 130)),
+            (crate::tests::scene(0.0, 0.3), (97, 65)),
+        ] {
+            let painter = || Painter::new(&scene, &[true], width, height);
+            let (bounded, (all, tile)) = (painter(), painter().without_bounds());
+            for (x, y) in pixels(width, height) {
+                let sample = bounded.sample(bounded.tiles.at(x, y), centre(x), centre(y));
+                let expected = all.sample(&tile, centre(x), centre(y));
+                assert_eq!(sample.color, expected.color, "({x}, {y})");
+                assert_eq!(sample.surface.packed(), expected.surface.packed(), "({x}, {y})");
+            }
+        }
+    }
 }

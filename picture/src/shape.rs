@@ -52,6 +52,14 @@ impl Shape {
         }
     }
 
+    /// Returns the ends of a segment and a distance from it, metres, within which all of the solid is.
+    pub(crate) fn extent(&self) -> ([DVec3; 2], f64) {
+        match self.solid {
+            Solid::Capsule { from, to, radius_m } => ([from, to], radius_m),
+            Solid::Cuboid { .. } => ([self.centre; 2], self.radius_m),
+        }
+    }
+
     /// Returns where the ray from `origin` along the unit vector `direction` enters the shape. A ray that starts inside
     /// does not.
     #[inline]

@@ -4,7 +4,7 @@ use gif::{ColorOutput, DecodeOptions};
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Scene};
 
 use crate::Error;
-use crate::film::{Film, FilmEpisode, FilmStep, draw_step, film_gif};
+use crate::film::{Film, FilmEpisode, FilmStep, draw_step, film_gif, film_gif_with};
 use crate::interpolate::between;
 use crate::painter::{render, render_achieved};
 use crate::raster::Raster;
@@ -15,7 +15,7 @@ const FILM: Film = Film { width: 96, height: 64, speed: 0.5 };
 const CONTROL_STEP_S: f64 = 0.04;
 
 /// An arm whose hand is above a cube at `y_m`.
-fn scene(time_s: f64, y_m: f32) -> Scene {
+pub(crate) fn scene(time_s: f64, y_m: f32) -> Scene {
     let cuboid =
         |centre, half_m| Cuboid { centre, orientation: UPRIGHT, half_extents_m: [half_m; 3] };
     let (elbow, hand) = ([-0.3, 0.0, 0.4], [0.0, y_m, 0.2]);
@@ -103,6 +103,29 @@ fn a_film_has_the_same_bytes_on_any_number_of_threads() {
         })
     };
     assert_eq!(on(1), on(3));
+}
+
+#[test]
+fn frames_without_visible_motion_show_the_same_bodies_and_the_time_of_each() {
+    // The cube moves by a hundredth of a pixel and then by several.
+    let step = |time_s: f64, y_m: f32| FilmStep { scene: scene(time_s, y_m), achieved: vec![] };
+    let still = FilmEpisode {
+        title: String::new(),
+        steps: vec![step(0.0, 0.0), step(0.4, 1e-4), step(0.8, 0.2)],
+    };
+    let film = Film { width: 160, height: 100, speed: 1.0 };
+    let mut frames = Vec::new();
+    let bytes = film_gif_with(&[still], &film, |n, n_all| frames.push((n, n_all))).unwrap();
+    assert_eq!(frames.len(), 21, "ten frames per step, and the last scene");
+    assert_eq!((frames[0], frames[20]), ((1, 21), (21, 21)));
+    let mut decoder = DecodeOptions::new().read_info(bytes.as_slice()).unwrap();
+    let mut rows = Vec::new();
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        rows.push(usize::from(frame.top) + usize::from(frame.height));
+    }
+    let caption_rows = 40;
+    assert!(rows[1..8].iter().all(|bottom| *bottom < caption_rows), "only the time: {rows:?}");
+    assert!(rows[13..20].iter().all(|bottom| *bottom > caption_rows), "the cube: {rows:?}");
 }
 
 #[test]
