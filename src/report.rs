@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 use tandem_report::{
     Baseline, Comparison, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, Run, TestEvaluation,
-    Trials, comparison, export, report_html, trials,
+    Trials, export, report_html, trials,
 };
 
 use tandem_core::Task;
@@ -84,7 +84,7 @@ fn print(
     }
     if !comparison.sections.is_empty() {
         output::print(comparison.text())?;
-        output::print(comparison::notes())?;
+        output::print(comparison.notes())?;
     }
     output::print(format_args!("report        {}", files.page.display()))?;
     if let Some(directory) = files.plots.first().and_then(|figure| figure.parent()) {

@@ -7,6 +7,7 @@ use crate::run::Run;
 use crate::table::{NONE, Table, share_spread, short_number, spread, wrapped};
 use crate::test_evaluation::TestEvaluation;
 
+mod contents;
 mod paper_table;
 mod summary;
 
@@ -39,6 +40,10 @@ pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: e
      success. ELR: 90 % of MSR per epoch until it was reached. IE, RT and ELR are – if MSR is below 0.5 or a run has fewer \
      than 5 evaluations. An epoch is `rounds.per_epoch` rounds, 50 by default.";
 
+/// Heads of columns that a table of few contacts lacks.
+const WITHOUT_ARM_CONTACT: &str = "without arm contact";
+const CONTACTS: &str = "contacts";
+
 /// The runs of one task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Section {
@@ -57,14 +62,6 @@ pub struct Baseline {
     pub label: String,
     /// Evaluation on test goals.
     pub test: TestEvaluation,
-}
-
-/// Returns the notes to [`Comparison::text`], for a terminal.
-#[must_use]
-pub fn notes() -> String {
-    let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, ranges \
-         and all intervals.";
-    format!("{}{}", wrapped(notes), wrapped(LEGEND).trim_end())
 }
 
 impl Comparison {
@@ -94,6 +91,15 @@ impl Comparison {
     pub fn markdown(&self) -> String {
         let tables = self.sections.iter().flat_map(Section::tables);
         tables.map(|table| table.markdown()).collect::<Vec<_>>().join("\n")
+    }
+
+    /// Returns the notes to [`Comparison::text`], for a terminal.
+    #[must_use]
+    pub fn notes(&self) -> String {
+        let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, \
+             ranges and all intervals.";
+        let legend = if self.is_in_paper() { wrapped(LEGEND) } else { String::new() };
+        format!("{}{legend}", wrapped(notes)).trim_end().to_owned()
     }
 
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
@@ -134,7 +140,7 @@ impl Section {
             if self.has_success_without_contact() {
                 tables.push(self.cost(Quantity::SuccessWithoutContact));
             }
-            tables.push(self.measures());
+            tables.extend(self.is_in_paper().then(|| self.measures()));
         }
         tables
     }
@@ -144,7 +150,8 @@ impl Section {
     pub fn summaries(&self) -> Vec<Table> {
         let mut tables = vec![self.success_summary()];
         if !self.groups.is_empty() {
-            tables.extend([self.cost_summary(), self.measures_summary()]);
+            tables.push(self.cost_summary());
+            tables.extend(self.is_in_paper().then(|| self.measures_summary()));
         }
         tables
     }
@@ -167,7 +174,7 @@ impl Section {
     fn measures(&self) -> Table {
         let title =
             format!("{}: measures of the paper's Table 2, in the runs' epochs", self.setup.title());
-        let mut table = Table::new(title, &["strategy", "runs", "IE", "RT", "MSR", "ELR"]);
+        let mut table = Table::new(title, &[self.label_head(), "runs", "IE", "RT", "MSR", "ELR"]);
         for group in &self.groups {
             table.rows.push(vec![
                 group.label.clone(),
@@ -181,22 +188,12 @@ impl Section {
         table
     }
 
-    /// Returns whether all runs have evaluated the success without contact between the arms.
-    pub(crate) fn has_success_without_contact(&self) -> bool {
-        self.groups.iter().all(SeedGroup::has_success_without_contact)
-    }
-
-    /// Returns whether the task reports contacts; true if it is unknown.
-    pub(crate) fn reports_contacts(&self) -> bool {
-        self.groups.iter().flat_map(|group| &group.runs).all(Run::reports_contacts)
-    }
-
     /// Returns what the runs needed to reach the [`MILESTONES`] of `measure`.
     fn cost(&self, measure: Quantity) -> Table {
         let mut table = Table::new(
             cost_title(self, measure),
             &[
-                "strategy",
+                self.label_head(),
                 "env steps to 50 %",
                 "90 %",
                 "95 %",
@@ -233,19 +230,19 @@ impl Section {
         table
     }
 
-    /// Returns the success, with intervals, of the policies that the runs kept, on test goals and on the goals that selected
+    /// Returns the success, with intervals, of the best policies of the runs, on test goals and on the goals that selected
     /// them, and of the last evaluation.
     fn success(&self) -> Table {
         let title = format!("{}: success of the policy alone [95 % interval]", self.setup.title());
         let header = [
-            "strategy",
+            self.label_head(),
             "env steps",
             "test goals",
-            "without arm contact",
-            "kept policy",
+            WITHOUT_ARM_CONTACT,
+            "best policy",
             "last evaluation",
             "joint goal",
-            "contacts",
+            CONTACTS,
         ];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
@@ -264,6 +261,12 @@ impl Section {
         let reports_contacts = self.reports_contacts();
         let baselines = self.baselines.iter();
         table.rows.extend(baselines.map(|baseline| baseline_row(baseline, reports_contacts)));
+        if !self.may_have_arm_contact() {
+            table.remove_column(WITHOUT_ARM_CONTACT);
+        }
+        if !reports_contacts {
+            table.remove_column(CONTACTS);
+        }
         table
     }
 }
@@ -273,7 +276,7 @@ fn test_success(run: &Run) -> Option<(f64, u64)> {
     run.test.as_ref().map(|test| (test.success, test.n_episodes))
 }
 
-/// Returns the success of the policy that a run kept, on the goals that selected it, and the number of its episodes.
+/// Returns the success of the best policy of a run, on the goals that selected it, and the number of its episodes.
 fn best_success(run: &Run) -> Option<(f64, u64)> {
     run.best().map(|row| (row.success, row.n_episodes))
 }

@@ -62,7 +62,7 @@ impl Run {
         Ok(Self { name, rows, ..Self::default() })
     }
 
-    /// Returns the evaluation of the policy that the run kept as its best.
+    /// Returns the evaluation of the run's best policy, on the goals that selected it.
     ///
     /// If no row is marked as the best, returns the first row with the highest success.
     #[must_use]

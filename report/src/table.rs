@@ -43,6 +43,14 @@ impl Table {
         Self { title, header, rows: Vec::new() }
     }
 
+    /// Removes the column with a head, if there is one.
+    pub(crate) fn remove_column(&mut self, head: &str) {
+        let Some(idx) = self.header.iter().position(|other| other == head) else { return };
+        for row in std::iter::once(&mut self.header).chain(&mut self.rows) {
+            row.remove(idx);
+        }
+    }
+
     /// Formats the table for a terminal. The first column is left-aligned, the others are right-aligned.
     ///
     /// If the table is wider than a terminal, a long first cell has a line of its own, above the other cells of

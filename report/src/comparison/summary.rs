@@ -9,12 +9,16 @@ use crate::measures::CostOf;
 use crate::quantity::Quantity;
 use crate::table::{NONE, Table, mean, optional, short_number};
 
+/// Head of the column of success without contact between the arms.
+const NO_CONTACT: &str = "no contact";
+
 impl Section {
-    /// Returns the success on test goals with its interval, and that of the policies that the runs kept, on the goals that selected
+    /// Returns the success on test goals with its interval, and that of the best policies of the runs, on the goals that selected
     /// them.
     pub(super) fn success_summary(&self) -> Table {
         let title = format!("{}: success of the policy alone, on test goals", self.setup.title());
-        let header = ["strategy", "runs", "success", "95 % interval", "no contact", "kept policy"];
+        let (label, success) = (self.label_head(), "success");
+        let header = [label, "runs", success, "95 % interval", NO_CONTACT, "best policy"];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
             let (test, interval) = group.share(test_success);
@@ -39,6 +43,9 @@ impl Section {
                 NONE.to_owned(),
             ]
         }));
+        if !self.may_have_arm_contact() {
+            table.remove_column(NO_CONTACT);
+        }
         table
     }
 
@@ -50,7 +57,7 @@ impl Section {
         };
         let title = cost_title(self, measure);
         let header =
-            ["strategy", "steps to 50 %", "90 %", "95 %", "min to 90 %", "advice", "steps"];
+            [self.label_head(), "steps to 50 %", "90 %", "95 %", "min to 90 %", "advice", "steps"];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
             let at = |success, value: CostOf| group.at_milestone((measure, success), value);
@@ -70,7 +77,7 @@ impl Section {
     /// Returns the means of the paper's measures.
     pub(super) fn measures_summary(&self) -> Table {
         let title = format!("{}: measures of the paper's Table 2", self.setup.title());
-        let mut table = Table::new(title, &["strategy", "IE", "RT", "MSR", "ELR"]);
+        let mut table = Table::new(title, &[self.label_head(), "IE", "RT", "MSR", "ELR"]);
         for group in &self.groups {
             table.rows.push(vec![
                 group.label.clone(),

@@ -29,8 +29,12 @@ pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
         let grid = plot_grid(&plots.from_scratch);
         body.push_str(&format!("<h2>Learning from scratch</h2>{grid}"));
     }
-    let paragraphs = [LEGEND, NOTES].map(|text| format!("<p>{}</p>", escaped(text)));
-    body.push_str(&format!("<h2>Notes</h2>{}", paragraphs.concat()));
+    let paragraph = |text: &str| format!("<p>{}</p>", escaped(text));
+    if !comparison.is_in_paper() {
+        body.push_str(&format!("<h2>Notes</h2>{}", paragraph(NOTES)));
+        return body;
+    }
+    body.push_str(&format!("<h2>Notes</h2>{}{}", paragraph(LEGEND), paragraph(NOTES)));
     let source = format!("<p>{}</p><p>{}</p>", escaped(PAPER_NOTES), escaped(paper::SOURCE));
     let paper = format!("{}{source}", titled_table(&paper_table()));
     body.push_str(&details("The paper's values", &paper));
