@@ -14,7 +14,7 @@ use crate::exit::{Exit, Failed};
 use crate::{access, metrics, policy_file, signals};
 
 pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
-    let source = PolicySource::new(args.policy, args.critic)?;
+    let source = PolicySource::new(&args.policy, args.critic)?;
     let own = metrics::of_process("teacher");
     let server_config =
         access::server_config(&args.listen, &args.secret)?.with_metrics(own.clone());
@@ -57,12 +57,12 @@ enum PolicySource {
 
 impl PolicySource {
     /// Distinguishes URLs from files, and checks files before anything is bound.
-    fn new(policy: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
-        match policy_address(&policy) {
+    fn new(policy: &Path, critic: Option<PathBuf>) -> Result<Self, Failed> {
+        match policy_address(policy) {
             Some(_) if critic.is_some() => Err(teacher_failed(Error::SurplusCritic)),
             Some(address) => Ok(Self::Server(address.to_owned())),
             None => {
-                let policy = policy_file::file_of(&policy)?.into_owned();
+                let policy = policy_file::file_of(policy)?.into_owned();
                 policy::load(&policy, critic.as_deref()).map_err(teacher_failed)?;
                 Ok(Self::File { policy, critic })
             }
