@@ -150,7 +150,8 @@ pub(crate) struct ReportArgs {
     /// Evaluates a one-arm policy on both arms, the baseline without a student; can be repeated.
     #[arg(long, value_name = "FILE|DIR")]
     pub(crate) composed_teachers: Vec<PathBuf>,
-    /// Plays the test goals with this policy, a file or a run directory, and shows a success and a failure as film strips; can be repeated.
+    /// Plays the test goals with this policy, a file or a run directory, and shows a success and a failure as film strips;
+    /// can be repeated.
     #[arg(long, value_name = "FILE|DIR")]
     pub(crate) film_strips: Vec<PathBuf>,
     /// Draws all trials, not only failed ones.

@@ -62,8 +62,8 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
     /// Policy file of the teacher, a run directory for the best policy of the run, the ONNX model of an actor (*.onnx),
-    /// or http://HOST:PORT of a server of tandem.v1.Policy without a token [default: the shipped teacher of the task]. With --recipe paper it should be a
-    /// teacher of that recipe; otherwise a message says so.
+    /// or http://HOST:PORT of a server of tandem.v1.Policy without a token [default: the shipped teacher of the task].
+    /// With --recipe paper it should be a teacher of that recipe; otherwise a message says so.
     #[arg(long, value_name = "FILE|DIR|URL")]
     pub(crate) teacher: Option<PathBuf>,
     /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
