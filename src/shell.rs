@@ -1,10 +1,24 @@
 //! Commands that the program prints for a shell.
 
+use std::os::unix::ffi::OsStrExt as _;
 use std::path::Path;
 
 /// Returns a path as a word of a shell's command line.
 pub(crate) fn shell_word(path: &Path) -> String {
-    shell_text(path.display().to_string())
+    match path.to_str() {
+        Some(text) => shell_text(text.to_owned()),
+        None => byte_word(path.as_os_str().as_bytes()),
+    }
+}
+
+/// Returns bytes that are not UTF-8 as a word for bash, zsh and other shells that know `$'…'`.
+fn byte_word(bytes: &[u8]) -> String {
+    let character = |byte: &u8| match byte {
+        b'\'' | b'\\' => format!("\\{}", char::from(*byte)),
+        b' '..=b'~' => char::from(*byte).to_string(),
+        byte => format!("\\x{byte:02x}"),
+    };
+    format!("$'{}'", bytes.iter().map(character).collect::<String>())
 }
 
 /// Returns a text as a word of a shell's command line.
@@ -18,6 +32,9 @@ pub(crate) fn shell_text(text: String) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+    use std::process::Command;
+
     use super::*;
 
     #[test]
@@ -30,5 +47,14 @@ mod tests {
         ] {
             assert_eq!(shell_word(Path::new(path)), expected);
         }
+    }
+
+    #[test]
+    fn a_shell_gets_the_bytes_of_any_path() {
+        let path = Path::new(OsStr::from_bytes(b"a\xffb'c\\ \n1"));
+        let word = shell_word(path);
+        assert_eq!(word, r"$'a\xffb\'c\\ \x0a1'");
+        let printed = Command::new("bash").args(["-c", &format!("printf %s {word}")]).output();
+        assert_eq!(printed.expect("bash runs").stdout, path.as_os_str().as_bytes());
     }
 }

@@ -426,11 +426,14 @@ fn failures(statuses: &[RunStatus]) -> Result<(), Failed> {
 }
 
 fn print_resume_command(args: &SweepArgs, out: &Path, end: SweepEnd) {
-    let options = match args.only {
+    let mut options = match args.only {
         Some(only) => format!(" --only {only}"),
         None if args.jobs > 1 => format!(" --jobs {}", args.jobs),
         None => String::new(),
     };
+    if args.dashboard.no_dashboard {
+        options.push_str(" --no-dashboard");
+    }
     output::message(match end {
         SweepEnd::Saving => {
             "interrupted; runs may still be saving, which the next start waits for. Resume with:"

@@ -27,7 +27,8 @@ impl<'a> RunInputs<'a> {
     pub(super) fn write(plan: &Plan, lock: &'a RunLock) -> Result<Self, Failed> {
         let inputs = Self { directory: in_use(&plan.out), lock };
         let failed = || format!("cannot write to {}", plan.out.display());
-        std::fs::create_dir_all(&inputs.directory).or_exit(Exit::TryAgain, failed)?;
+        let directory = || format!("cannot create {}", inputs.directory.display());
+        std::fs::create_dir_all(&inputs.directory).or_cannot_write(directory)?;
         // An earlier start that was killed has left the address of its learner.
         drop(std::fs::remove_file(learner_address(&plan.out)));
         let text = run_file::to_text(&plan.config)?;

@@ -133,18 +133,16 @@ impl Plan {
 
     /// Rejects a teacher other than the run's own.
     fn check_teacher(&self) -> Result<(), Failed> {
-        if let Some(teacher) = &self.teacher {
-            teacher.check_recorded(&self.policies())?;
-        }
-        let Some(teacher) = self.foreign_teacher() else { return Ok(()) };
-        // A missing or damaged copy is replaced.
-        match TeacherFile::stored_in(&self.policies()) {
-            Some(own) if own.digest != teacher.digest() => Err(Failed::usage(format!(
+        let Some(teacher) = &self.teacher else { return Ok(()) };
+        let own = self.foreign_teacher().and_then(|_| TeacherFile::stored_in(&self.policies()));
+        match own.filter(|own| own.digest != teacher.digest()) {
+            Some(own) => Err(Failed::usage(format!(
                 "--teacher {}: the run's own teacher, {}, is another policy: leave --teacher out, or start a new run",
                 teacher.path().display(),
                 own.path.display()
             ))),
-            _ => Ok(()),
+            // A missing or damaged copy is replaced by the same policy.
+            None => teacher.check_recorded(&self.policies()),
         }
     }
 
