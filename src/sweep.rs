@@ -368,7 +368,10 @@ fn print_plan(
 ) -> Result<(), Failed> {
     let numbered = statuses.iter().zip(first..);
     if as_json {
-        let run = |(status, number): (&RunStatus, usize)| json!({"index": number, "name": status.run.name, "state": status.state_name(), "failure": status.failure});
+        let run = |(status, number): (&RunStatus, usize)| {
+            let (name, state) = (&status.run.name, status.state_name());
+            json!({"index": number, "name": name, "state": state, "failure": status.failure})
+        };
         let runs: Vec<Value> = numbered.map(run).collect();
         return output::print(json!({"out": out.to_string_lossy(), "runs": runs}));
     }

@@ -91,8 +91,8 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     }
     if former_round == Some(last.round) {
         output::message(format_args!(
-            "nothing was trained: {}; a larger --max-env-steps, --max-minutes or --until-success continues the run, 0 removes a \
-             limit",
+            "nothing was trained: {}; a larger --max-env-steps, --max-minutes or --until-success continues the run, 0 \
+             removes a limit",
             last.end_reason
         ));
     }

@@ -244,7 +244,7 @@ fn a_run_whose_ledger_loses_its_log_restarts_the_teacher() {
     let ended = run.wait_with_output().expect("ends");
     assert_eq!(digest(&ended), UNDISTURBED.1);
     let log = fs::read_to_string(out.join("tandem.log")).expect("a log");
-    assert!(log.contains("the ledger was removed or replaced"), "{log}");
+    assert!(log.contains("a file beside the ledger was removed or replaced"), "{log}");
 }
 
 #[test]

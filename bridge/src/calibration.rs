@@ -134,6 +134,14 @@ impl Driver for Recorder {
     fn stop(&mut self) -> Result<(), DriverError> {
         self.driver.stop()
     }
+
+    fn disconnect(&mut self, reason: &DriverError) {
+        self.driver.disconnect(reason);
+    }
+
+    fn confirms_stop(&self) -> bool {
+        self.driver.confirms_stop()
+    }
 }
 
 /// The caller's side of a measurement: its clock, its output and its interruption.

@@ -42,8 +42,11 @@ pub trait Driver {
     /// Returns an error if the command could not be sent. The drives then brake after [`SILENCE_S`] without commands.
     fn stop(&mut self) -> Result<(), DriverError>;
 
-    /// Returns whether the arms have confirmed the last order to stop, as far as they answer orders. Arms that only send
-    /// states confirm it with the next one.
+    /// Ends the connection to arms that have fallen silent, for this reason, so that another one can take its place.
+    fn disconnect(&mut self, _reason: &DriverError) {}
+
+    /// Returns whether the arms have answered the last order to stop. Drivers whose arms do not answer orders return true:
+    /// the executor waits for a state.
     fn confirms_stop(&self) -> bool {
         true
     }
@@ -60,6 +63,10 @@ impl<D: Driver + ?Sized> Driver for Box<D> {
 
     fn stop(&mut self) -> Result<(), DriverError> {
         (**self).stop()
+    }
+
+    fn disconnect(&mut self, reason: &DriverError) {
+        (**self).disconnect(reason);
     }
 
     fn confirms_stop(&self) -> bool {

@@ -237,6 +237,9 @@ impl<D: Driver> Executor<D> {
         if let Some(error) = &self.exchange_error {
             return Err(ResetError::Driver(error.clone()));
         }
+        if !self.stop_is_confirmed() {
+            return Err(ResetError::Unconfirmed);
+        }
         let got = self.monitor.n_good();
         let stale_s = self.monitor.stale_s(now_s);
         let stale = stale_s > self.settings.state_hold_s;
@@ -259,7 +262,10 @@ impl<D: Driver> Executor<D> {
     }
 
     fn too_few_states(&self, got: u32, now_s: f64) -> ResetError {
-        let is_new = |stop: &&Stop| got == 0 && now_s - stop.when_s <= self.settings.state_stop_s;
+        let is_new = |stop: &&Stop| {
+            let is_requested = matches!(stop.cause, StopCause::Requested | StopCause::ShutDown);
+            got == 0 && !is_requested && now_s - stop.when_s <= self.settings.state_stop_s
+        };
         let rejected = self.later_stop.as_ref().filter(is_new).map(|stop| stop.cause.clone());
         ResetError::States { got, rejected }
     }
@@ -384,15 +390,17 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Counts silent arms as disconnected until a new state arrives, and forgets where they were.
+    /// Counts silent arms as disconnected until a new state arrives, and forgets where they were. The connection to real
+    /// arms ends, which brakes them too, so that a reset can connect again.
     fn lose(&mut self, now_s: f64) {
+        self.monitor.forget();
         if self.exchange_error.is_some() {
             return;
         }
         let error = DriverError::Disconnected { what: format!("no new state for {LOST_S} s") };
         self.exchange_error = Some(error.clone());
-        self.monitor.forget();
-        self.halt(StopCause::Driver(error).anywhere(), now_s);
+        self.halt(StopCause::Driver(error.clone()).anywhere(), now_s);
+        self.driver.disconnect(&error);
     }
 
     /// Stops the arms in the fastest way. Keeps the first cause and the newest one.

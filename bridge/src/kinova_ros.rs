@@ -421,6 +421,10 @@ impl Driver for KinovaRosDriver {
         self.unless_failed(|driver| (0..driver.arms.len()).try_for_each(|arm| driver.stop_arm(arm)))
     }
 
+    fn disconnect(&mut self, reason: &DriverError) {
+        self.unless_failed(|_| Err::<(), _>(reason.clone())).ok();
+    }
+
     /// Returns whether every node has answered the call of `in/stop`.
     fn confirms_stop(&self) -> bool {
         self.failure.is_none() && self.arms.iter().all(|arm| arm.control == Control::Stopped)

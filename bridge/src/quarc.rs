@@ -280,6 +280,10 @@ impl Driver for QuarcDriver {
         let stop = Command { number: self.number, order: Order::Stop };
         self.unless_failed(|driver| driver.send(&stop))
     }
+
+    fn disconnect(&mut self, reason: &DriverError) {
+        self.unless_failed(|_| Err::<(), _>(reason.clone())).ok();
+    }
 }
 
 /// Waits for the first whole state.

@@ -154,7 +154,8 @@ impl Arms<'_> {
         loop {
             self.tick_stopped()?;
             let got = self.executor.n_good();
-            if got >= crate::executor::GOOD_STATES && self.executor.at_rest() {
+            let is_good = got >= crate::executor::GOOD_STATES && self.executor.stop_is_confirmed();
+            if is_good && self.executor.at_rest() {
                 return Ok(());
             }
             if self.clock.now_s() > until_s {

@@ -25,8 +25,9 @@ const REST_M: f32 = 0.01;
 const N_RESTING: usize = 3;
 /// Motion since an earlier frame up to which a frame shows the bodies as that did, pixels.
 const STILL_PX: f64 = 0.25;
-/// Maximum number of frames that show the bodies of one frame, and of such groups of frames in memory at a time.
+/// Maximum number of frames that show the bodies of one frame.
 const MAX_STILL: usize = 8;
+/// Groups of such frames that are in memory at a time.
 const CHUNK: usize = 16;
 /// Smallest and largest width and height of a picture, pixels.
 const SIZES_PX: std::ops::RangeInclusive<usize> = 64..=4096;

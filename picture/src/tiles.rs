@@ -32,9 +32,12 @@ impl Tiles {
         bounds: impl Iterator<Item = &'a Rectangle>,
         list: impl Fn(&mut Tile) -> &mut Vec<usize>,
     ) {
-        let n_rows = self.tiles.len() / self.n_columns.max(1);
+        if self.tiles.is_empty() {
+            return;
+        }
+        let n_rows = self.tiles.len() / self.n_columns;
         for (idx, Rectangle { low, high }) in bounds.enumerate() {
-            for row in tile_of(low[1])..=tile_of(high[1]).min(n_rows.saturating_sub(1)) {
+            for row in tile_of(low[1])..=tile_of(high[1]).min(n_rows - 1) {
                 for column in tile_of(low[0])..=tile_of(high[0]).min(self.n_columns - 1) {
                     list(&mut self.tiles[row * self.n_columns + column]).push(idx);
                 }

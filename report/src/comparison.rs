@@ -230,7 +230,7 @@ impl Section {
         table
     }
 
-    /// Returns the success, with intervals, of the best policies of the runs, on test goals and on the goals that selected
+    /// Returns the success, with intervals, of the runs' best policies, on test goals and on the goals that selected
     /// them, and of the last evaluation.
     fn success(&self) -> Table {
         let title = format!("{}: success of the policy alone [95 % interval]", self.setup.title());

@@ -24,8 +24,8 @@ pub(super) fn calibrate(args: CalibrateArgs) -> Result<(), Failed> {
     };
     let cell = Cell::load(Some(&path))?;
     if args.arms.driver != DriverName::Sim {
-        let question = "Every joint of both arms turns by some degrees and back. Somebody watches them with a hand on \
-                        the emergency stop, and nothing stands in their way";
+        let question = "Every joint of both arms turns by some degrees and back. A person must watch them with a hand \
+                        on the emergency stop, and their way must be clear";
         // Nothing handles Ctrl-C yet, so that it ends the process.
         confirm(args.confirmation.yes, question, "yes", &CancellationToken::new())?;
     }

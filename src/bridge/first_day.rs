@@ -92,8 +92,8 @@ pub(super) fn to_start(args: ToStartArgs) -> Result<(), Failed> {
     let cell = Cell::load(args.arms.cell.as_deref())?;
     if args.arms.driver != DriverName::Sim {
         cell.require_places()?;
-        let question = "Both arms move slowly to their start posture. Somebody watches them with a hand on the \
-                        emergency stop, and nothing stands in their way";
+        let question = "Both arms move slowly to their start posture. A person must watch them with a hand on the \
+                        emergency stop, and their way must be clear";
         // Nothing handles Ctrl-C yet, so that it ends the process.
         confirm(args.confirmation.yes, question, "yes", &CancellationToken::new())?;
     }

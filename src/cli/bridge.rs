@@ -202,8 +202,8 @@ Examples:
   tandem bridge calibrate --driver quarc --arms-at tcpip://10.0.0.5:18000 \\
       --cell cell.toml --speed 0.1
 
-Asks first whether a person watches real arms. One joint after the other turns by up to 6 degrees and back. The arms need room, and no bridge may \
-be connected to them. Other keys of the file and its comments stay as they are. Ctrl-C stops the arms."
+With real arms, the command first asks for confirmation that a person watches them. One joint after \
+the other turns by up to 6 degrees and back. The arms need room, and no bridge may be connected to them. Other keys of the file and its comments stay as they are. Ctrl-C stops the arms."
 )]
 pub(crate) struct CalibrateArgs {
     #[command(flatten)]

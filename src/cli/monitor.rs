@@ -43,7 +43,7 @@ Examples:
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
 
-Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, 75 the learner cannot be \
+Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, directory or address, 75 the learner cannot be \
 reached.")]
 pub(crate) struct StatusArgs {
     /// Run directory of a `tandem train` on this machine, or address of a learner or relay.

@@ -89,9 +89,9 @@ pub(crate) struct TeacherArgs {
         hide_env_values = true
     )]
     pub(crate) ledger: OsString,
-    /// Exits when the file of the ledger was removed or replaced, for a parent process that restarts the teacher.
+    /// Exits when the ledger must be opened again, for a parent process that restarts the teacher.
     #[arg(long, hide = true)]
-    pub(crate) exit_without_ledger: bool,
+    pub(crate) exit_for_restart: bool,
     #[command(flatten)]
     pub(crate) listen: ListenArgs,
     #[command(flatten)]

@@ -27,7 +27,7 @@ pub(crate) fn teacher(args: TeacherArgs) -> Result<(), Failed> {
             check_digest(&policy, args.policy_digest.as_deref())?;
             let ledger = open_ledger(args.ledger).map_err(teacher_failed)?;
             let advisor = Advisor::new(policy, ledger).map_err(teacher_failed)?;
-            Ok(if args.exit_without_ledger { advisor.ending_without_ledger() } else { advisor })
+            Ok(if args.exit_for_restart { advisor.ending_for_restart() } else { advisor })
         };
         let advisor = tokio::select! {
             advisor = opened => advisor?,
@@ -114,7 +114,7 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         }
         E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
         E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
-        E::LedgerLost | E::Transport(_) | E::Thread(_) => Exit::TryAgain,
+        E::LedgerNeedsRestart | E::Transport(_) | E::Thread(_) => Exit::TryAgain,
         E::SurplusCritic => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,

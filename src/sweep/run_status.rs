@@ -12,7 +12,7 @@ use toml::{Table, Value};
 
 use super::sweep_file::{PlannedRun, flattened};
 use crate::exit::Failed;
-use crate::{run_directory, run_file};
+use crate::{policy_file, run_directory, run_file};
 
 /// A run and its status.
 #[derive(Debug)]
@@ -168,7 +168,8 @@ fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     let Some(teacher) = &run.teacher else { return true };
     let copy = regular_file::read(&teacher_copy(teacher, dir));
     // The run itself reports a missing file.
-    let named = regular_file::read(teacher);
+    let named = policy_file::file_of(teacher).map_err(|failed| failed.into_error());
+    let named = named.and_then(|file| Ok(regular_file::read(&file)?));
     copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
 }
 

@@ -29,7 +29,7 @@ pub(super) fn teacher(plan: &Plan) -> Vec<OsString> {
         }
     }
     push_path(&mut args, "--ledger", &plan.ledger());
-    args.push("--exit-without-ledger".into());
+    args.push("--exit-for-restart".into());
     args
 }
 

@@ -28,8 +28,8 @@ pub struct Advisor {
     strategies: BTreeMap<String, Strategy>,
     /// Accounts for which a step was asked about again with other numbers, so that each gets one warning.
     reused: BTreeSet<String>,
-    /// Whether the service ends when the ledger is lost.
-    ends_without_ledger: bool,
+    /// Whether the service ends when the ledger must be opened again.
+    ends_for_restart: bool,
 }
 
 /// A description of the teacher.
@@ -90,20 +90,20 @@ impl Advisor {
             ledger,
             strategies: BTreeMap::new(),
             reused: BTreeSet::new(),
-            ends_without_ledger: false,
+            ends_for_restart: false,
         })
     }
 
-    /// Makes the service end with [`Error::LedgerLost`] when the ledger's storage was removed or replaced. Otherwise it
-    /// continues to refuse charges.
+    /// Makes the service end with [`Error::LedgerNeedsRestart`] when only another process can charge the ledger's accounts.
+    /// Otherwise it continues to refuse charges.
     #[must_use]
-    pub fn ending_without_ledger(self) -> Self {
-        Self { ends_without_ledger: true, ..self }
+    pub fn ending_for_restart(self) -> Self {
+        Self { ends_for_restart: true, ..self }
     }
 
-    /// Returns whether the service must end, because the ledger is lost.
+    /// Returns whether the service must end, because the ledger must be opened again.
     pub(crate) fn must_end(&self) -> bool {
-        self.ends_without_ledger && self.ledger.is_lost()
+        self.ends_for_restart && self.ledger.needs_restart()
     }
 
     /// Returns the description of the teacher.

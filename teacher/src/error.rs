@@ -55,9 +55,9 @@ pub enum Error {
     /// The ledger cannot be opened.
     #[error(transparent)]
     OpenLedger(#[from] OpenError),
-    /// The storage of the ledger was removed or replaced, and the service ends.
-    #[error("the ledger was removed or replaced")]
-    LedgerLost,
+    /// Only another process can charge the accounts of the ledger, and the service ends.
+    #[error("a file beside the ledger was removed or replaced: start the teacher again")]
+    LedgerNeedsRestart,
     /// The teacher's networks returned infinity or NaN.
     #[error(
         "the teacher's networks returned a number that is not finite for step {step} of episode {episode}"

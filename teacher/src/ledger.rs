@@ -107,8 +107,9 @@ pub trait Ledger: Send {
         None
     }
 
-    /// Returns whether the storage was removed or replaced, so that no later attempt to write can succeed.
-    fn is_lost(&self) -> bool {
+    /// Returns whether nothing more can be written until another process opens the ledger, which then has every answered
+    /// charge.
+    fn needs_restart(&self) -> bool {
         false
     }
 }

@@ -248,7 +248,7 @@ fn status(error: &Error) -> Status {
             Status::failed_precondition(message)
         }
         Error::Ledger(LedgerError::Unavailable { .. })
-        | Error::LedgerLost
+        | Error::LedgerNeedsRestart
         | Error::Timeout(_)
         | Error::RemotePolicy(RemoteError::Unavailable { .. }) => {
             tracing::error!(%error, "request failed");

@@ -63,6 +63,11 @@ impl From<CheckError> for StartError {
     }
 }
 
+/// Returns the beginning of a message about an arm.
+fn named(arm: Option<ArmIndex>) -> String {
+    arm.map_or_else(String::new, |arm| format!("arm {}: ", arm.0))
+}
+
 /// Returns what a message says about the newest state.
 fn advice(rejected: Option<&StopCause>) -> String {
     rejected
@@ -91,7 +96,7 @@ pub enum ResetError {
     #[error(transparent)]
     Driver(DriverError),
     /// An arm is beyond a limit at which it would be stopped again.
-    #[error("{}{cause}: move the arm clear by hand, or correct the cell file", .arm.map_or_else(String::new, |arm| format!("arm {}: ", arm.0)))]
+    #[error("{}{cause}: move the arm clear by hand, or correct the cell file", named(*.arm))]
     Limit {
         /// The arm, if the limit concerns one.
         arm: Option<ArmIndex>,
@@ -106,6 +111,9 @@ pub enum ResetError {
         /// Why the newest state is not good, if it is not.
         rejected: Option<StopCause>,
     },
+    /// The arms have not confirmed the last order to stop.
+    #[error("the arms have not confirmed the last stop: try again")]
+    Unconfirmed,
     /// A joint still moves.
     #[error("the arms still move")]
     Moving,

@@ -147,7 +147,7 @@ impl ControlLoop {
                     self.executor.shut_down(now_s);
                     self.jobs.close();
                     while self.jobs.try_recv().is_ok() {}
-                } else if self.executor.at_rest() {
+                } else if self.executor.at_rest() && self.executor.stop_is_confirmed() {
                     return;
                 }
                 n_shutdown += 1;

@@ -66,6 +66,14 @@ fn silent_arms_are_stopped() {
         test.assert_rests();
         assert_eq!(test.n_calls("in/stop"), [2, 2]);
         assert!(test.side.ros().nodes.iter().all(|node| node.stopped));
+        for _ in 0..110 {
+            test.rig.tick();
+        }
+        assert!(test.rig.executor.exchange_error().is_some());
+        eventually("the connection ends, so that another one can take its place", || {
+            test.side.pass();
+            !test.side.ros().connected()
+        });
     }
 }
 

@@ -68,6 +68,14 @@ impl<D: Listen> Driver for Patient<D> {
     fn stop(&mut self) -> Result<(), DriverError> {
         self.inner.stop()
     }
+
+    fn disconnect(&mut self, reason: &DriverError) {
+        self.inner.disconnect(reason);
+    }
+
+    fn confirms_stop(&self) -> bool {
+        self.inner.confirms_stop()
+    }
 }
 
 /// The executor and its clock.
@@ -101,7 +109,8 @@ impl<D: Driver> Rig<D> {
         }
         // Some arms report less often than others.
         for _ in 0..100 {
-            if let Err(ResetError::States { .. }) = self.executor.reset(OWNER, self.now_s) {
+            let reset = self.executor.reset(OWNER, self.now_s);
+            if let Err(ResetError::States { .. } | ResetError::Unconfirmed) = reset {
                 self.tick();
             }
         }

@@ -348,6 +348,7 @@ impl Rig {
             match reset.await {
                 Err(status) if status.message().contains("good states") => {}
                 Err(status) if status.message().contains("still move") => {}
+                Err(status) if status.message().contains("not confirmed") => {}
                 // The newest state may be older than the end of a fault.
                 Err(status) if status.message().starts_with("arm ") => {}
                 reset => return reset.map(|_| ()),

@@ -13,8 +13,8 @@ use crate::table::{NONE, Table, mean, optional, short_number};
 const NO_CONTACT: &str = "no contact";
 
 impl Section {
-    /// Returns the success on test goals with its interval, and that of the best policies of the runs, on the goals that selected
-    /// them.
+    /// Returns the success on test goals with its interval, and that of the runs' best policies, on the goals that
+    /// selected them.
     pub(super) fn success_summary(&self) -> Table {
         let title = format!("{}: success of the policy alone, on test goals", self.setup.title());
         let (label, success) = (self.label_head(), "success");

@@ -199,8 +199,8 @@ impl Ledger for SqliteLedger {
         self.warning.as_deref()
     }
 
-    fn is_lost(&self) -> bool {
-        self.file.is_displaced()
+    fn needs_restart(&self) -> bool {
+        self.file.has_lost_log()
     }
 }
 

@@ -90,7 +90,7 @@ impl AdvisorThread {
     /// Waits up to `grace` for the end of the thread. A thread that is still busy then is detached.
     ///
     /// # Errors
-    /// When the thread has panicked, or ended because the ledger is lost.
+    /// When the thread has panicked, or ended because the ledger must be opened again.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
             Ok(_ended) => match self.handle {
@@ -174,7 +174,7 @@ fn run_thread(
             stop.cancel();
         }
     }
-    if advisor.must_end() { Err(Error::LedgerLost) } else { Ok(()) }
+    if advisor.must_end() { Err(Error::LedgerNeedsRestart) } else { Ok(()) }
 }
 
 /// As [`run_thread`], on the runtime of the calls: requests of one simulated moment are answered in one batch.
@@ -192,7 +192,7 @@ async fn run_task(
             stop.cancel();
         }
     }
-    if advisor.must_end() { Err(Error::LedgerLost) } else { Ok(()) }
+    if advisor.must_end() { Err(Error::LedgerNeedsRestart) } else { Ok(()) }
 }
 
 /// Requests that are answered together.

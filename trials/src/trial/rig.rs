@@ -135,13 +135,14 @@ impl<'a> TrialRig<'a> {
             self.tick();
             match self.executor.reset(OWNER, self.now_s()) {
                 Ok(()) => return Ok(()),
-                Err(ResetError::Reported { arm, cause }) => reported = Some((arm, cause)),
+                Err(ResetError::Reported { arm, cause }) => reported = Some((Some(arm), cause)),
+                Err(ResetError::Limit { arm, cause }) => reported = Some((arm, cause)),
                 Err(_) => {}
             }
         }
         let Some((arm, cause)) = reported else { return self.check() };
         let when_s = self.now_s();
-        Err(FailureCause::Stopped(Stop { when_s, arm: Some(arm), joint: None, cause }))
+        Err(FailureCause::Stopped(Stop { when_s, arm, joint: None, cause }))
     }
 
     /// Returns the forces on the tools by the measured torques, world frame, newtons.

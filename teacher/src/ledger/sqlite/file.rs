@@ -76,9 +76,9 @@ impl LedgerFile {
         &self.path
     }
 
-    /// Returns whether the file was displaced.
-    pub(super) const fn is_displaced(&self) -> bool {
-        self.displaced.is_some()
+    /// Returns whether the log beside the file was displaced. The file itself has every answered charge then.
+    pub(super) fn has_lost_log(&self) -> bool {
+        self.displaced == Some(Displaced::Log)
     }
 
     /// Adds an account with an unspent budget, and returns its key.
