@@ -208,7 +208,7 @@ def arms_stop_without_the_master(rig):
         check(min(moving) > 10, "a motion continues without the master")
     at_s = time.monotonic()
     stopped = rig.tandem("stop")
-    check(stopped.returncode == 0, stopped.stderr)
+    check(stopped.returncode == 75 and "not confirmed" in stopped.stderr, (stopped.returncode, stopped.stderr))
     check_rest(rig, at_s)
     check(not any(record.lines("stop", at_s) for record in rig.records), "in/stop cannot be called")
     check_end(mover, "the arms are stopped")
