@@ -110,7 +110,6 @@ pub(crate) struct Bench {
     /// The number of stops outside of exchanges.
     n_stops: usize,
     newest: Order,
-    /// The last state.
     last: Option<PairState>,
     /// The connection that works, counted from 0.
     connection: usize,
@@ -131,8 +130,7 @@ impl Tap {
         let pair = SimulatedPair::new(cell, &at, 0.5, config);
         let drill = Drill::new(injector, settings);
         let (fault, newest) = (Fault::None, Order::Stop);
-        let (n_stops, connection, first, widest) = (0, 0, None, 0.0);
-        let last = None;
+        let (n_stops, connection, last, first, widest) = (0, 0, None, None, 0.0);
         let bench = Bench { pair, drill, fault, n_stops, newest, last, connection, first, widest };
         Self(Arc::new((Mutex::new(bench), Condvar::new())), 0)
     }
