@@ -16,7 +16,9 @@ use tandem_worker::{
     Perturbation, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
 };
 
+use crate::environment_file::server_option;
 use crate::exit::{Exit, Failed, OrExit as _};
+use crate::shell::shell_word;
 use crate::{clock, output};
 
 pub(crate) use served::{Part, measure_served};
@@ -132,11 +134,20 @@ fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
             counted(n_arms, "arm")
         ))),
         None => Err(Failed::usage(format!(
-            "{} is for task {:?}, which the simulator does not have: evaluate it with `tandem eval --env ADDR` or \
-             `--env-command CMD`",
+            "{} is for task {:?}, which the simulator does not have: evaluate it with {}",
             path.display(),
-            policy.layout.name()
+            policy.layout.name(),
+            evaluation_command(path)
         ))),
+    }
+}
+
+/// Returns the command that evaluates the policy of a task of a server, with the server of its run if that is known.
+fn evaluation_command(path: &Path) -> String {
+    let run = if path.is_dir() { Some(path) } else { path.parent().and_then(Path::parent) };
+    match run.and_then(server_option) {
+        Some(option) => format!("`tandem eval --policy {} {option}`", shell_word(path)),
+        None => "`tandem eval --env ADDR` or `--env-command CMD`".to_owned(),
     }
 }
 

@@ -16,6 +16,7 @@ mod clock;
 mod columns;
 mod dashboard;
 mod environment_command;
+mod environment_file;
 mod environment_server;
 mod eval;
 mod evaluation;

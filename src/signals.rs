@@ -1,10 +1,15 @@
 //! Signals, and the end of standard input.
 
+use std::time::Duration;
+
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::runtime;
+
+/// Time after a first signal in which others have no effect.
+const SETTLING_TIME: Duration = Duration::from_secs(1);
 
 /// Returns a token that is cancelled by SIGINT or SIGTERM and, if `exit_with_stdin`, when standard input closes.
 pub(crate) fn shutdown_token(exit_with_stdin: bool) -> Result<CancellationToken, Failed> {
@@ -23,6 +28,14 @@ pub(crate) fn shutdown_token(exit_with_stdin: bool) -> Result<CancellationToken,
         cancel.cancel();
     });
     Ok(token)
+}
+
+/// Waits for a second SIGINT or SIGTERM. One that follows the first at once does not count: a key can bounce, and programs
+/// such as `timeout` signal a process and its group.
+pub(crate) async fn second_shutdown() -> Result<(), Failed> {
+    tokio::time::sleep(SETTLING_TIME).await;
+    shutdown_token(false)?.cancelled().await;
+    Ok(())
 }
 
 /// Runs `work` on a thread of its own. If a signal or, with `exit_with_stdin`, the end of standard input comes first, the

@@ -14,11 +14,13 @@ use std::collections::VecDeque;
 use std::fs::{File, TryLockError};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
 use serde_json::{Value, json};
 use tandem_core::text::counted;
+use tandem_core::{Task, World};
 use tandem_dashboard::Site;
 use tandem_net::is_exposed;
 use tokio::sync::watch;
@@ -26,6 +28,7 @@ use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::cli::{EnvironmentArgs, SweepArgs};
+use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::shell::shell_word;
 use crate::{dashboard, output, runtime, signals};
@@ -74,6 +77,9 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         return print_plan((args.only.unwrap_or(0), &statuses), &out, args.json);
     }
     checked?;
+    if let Some(note) = classic_note(&statuses) {
+        output::message(note);
+    }
     let address = dashboard::address(&args.dashboard)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let end = runtime.block_on(async {
@@ -278,7 +284,7 @@ impl<'a> Sweep<'a> {
     /// Waits until the running runs have saved. A second interruption ends them at once.
     async fn save(mut self, mut running: JoinSet<(usize, RunOutcome)>) -> Result<SweepEnd, Failed> {
         self.display.print("interrupted: saving, a second Ctrl-C ends at once");
-        let interrupted_again = signals::shutdown_token(false)?;
+        let mut interrupted_again = pin!(signals::second_shutdown());
         let end = loop {
             tokio::select! {
                 joined = running.join_next() => match joined {
@@ -288,7 +294,7 @@ impl<'a> Sweep<'a> {
                     }
                     None => break SweepEnd::Saved,
                 },
-                () = interrupted_again.cancelled() => break SweepEnd::Saving,
+                again = &mut interrupted_again => break again.map(|()| SweepEnd::Saving)?,
             }
         };
         self.end("interrupted");
@@ -381,7 +387,23 @@ fn print_plan(
         let (state, name) = (status.state_name(), &status.run.name);
         output::print(format_args!("{number:>3}  {state:<10}{name}{failure}"))?;
     }
-    output::print(format_args!("{} in {}", counted(statuses.len(), "run"), out.display()))
+    output::print(format_args!("{} in {}", counted(statuses.len(), "run"), out.display()))?;
+    classic_note(statuses).map_or(Ok(()), output::print)
+}
+
+/// Returns a note if runs are of the classic world, whose tasks have the names that `tandem train --task` has for those of
+/// its default world.
+fn classic_note(statuses: &[RunStatus]) -> Option<String> {
+    let mut tasks =
+        statuses.iter().filter_map(|status| status.run.config.task.parse::<Task>().ok());
+    let task = tasks.find(|task| task.world() == World::Classic)?;
+    let name = task.name();
+    Some(wrapped(
+        &format!(
+            "{name} is in the classic world; in the default world of `tandem train` it is shared-{name}"
+        ),
+        "  ",
+    ))
 }
 
 fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {

@@ -1,7 +1,6 @@
 //! `tandem train`: starts a learner, a teacher and workers as processes, supervises them and reports the result.
 
 mod arguments;
-mod environment_file;
 mod inputs;
 mod plan;
 mod policy_server;
@@ -28,8 +27,8 @@ use crate::progress_json::progress_json;
 use crate::run_display::Display;
 use crate::shell::shell_word;
 use crate::{
-    clock, environment_server, metrics, output, run_directory, runtime, served_task, settings_page,
-    signals,
+    clock, environment_file, environment_server, metrics, output, run_directory, runtime,
+    served_task, settings_page, signals,
 };
 use inputs::RunInputs;
 use plan::Plan;
@@ -130,10 +129,9 @@ async fn run(
     if interrupted.is_cancelled() {
         display.print("interrupted: saving, a second Ctrl-C ends at once");
     }
-    let interrupted_again = signals::shutdown_token(false)?;
     let saved = tokio::select! {
         saved = processes.end(END_TIMEOUT) => saved,
-        () = interrupted_again.cancelled() => Saved::Yes,
+        interrupted_again = signals::second_shutdown() => interrupted_again.map(|()| Saved::Yes)?,
     };
     if saved == Saved::TooLate {
         display.print(NOT_SAVED);

@@ -184,7 +184,33 @@ fn an_interrupted_run_resumes_to_the_same_result() {
     assert_eq!(interrupted.status.code(), Some(130));
     let message = stderr(&interrupted);
     assert!(message.contains("tandem train --resume --out"), "{message}");
+    let (code, _, message) = status(&out);
+    assert_eq!(code, Some(75), "{message}");
+    assert!(message.contains("(saved after round") && message.contains("train --resume --out"));
     check_undisturbed_result(&resume(&out), &out);
+    let (code, shown, message) = status(&out);
+    assert_eq!((code, message.as_str()), (Some(0), ""), "{shown}");
+    assert!(shown.contains("shared-push with 2 arms, strategy") && shown.contains("best success"));
+    assert!(shown.ends_with("ended: complete\n"), "{shown}");
+    let (code, listed, _) = status(out.parent().expect("a parent"));
+    assert_eq!(code, Some(0));
+    assert!(listed.contains("run  complete  ") && listed.contains("success"), "{listed}");
+}
+
+#[test]
+fn a_run_that_is_signalled_twice_at_once_is_saved() {
+    let (_keep, out) = run_directory();
+    let run = start_with("1", LONG, &["--set", "checkpoint.every_rounds=1000"], &out);
+    let n_evaluations =
+        || fs::read_to_string(out.join("metrics.jsonl")).map(|text| text.lines().count());
+    assert!(eventually(|| n_evaluations().is_ok_and(|n| n >= 2)));
+    assert!(checkpoints(&out).is_empty());
+    signal("-INT", run.id());
+    std::thread::sleep(Duration::from_millis(5));
+    signal("-INT", run.id());
+    let interrupted = finish(run);
+    assert_eq!(interrupted.status.code(), Some(130), "{}", stderr(&interrupted));
+    assert_eq!(checkpoints(&out).len(), 1, "{}", stderr(&interrupted));
 }
 
 #[test]

@@ -40,12 +40,13 @@ impl Display {
 
     /// Adds a run that writes its lines to `log`.
     pub(super) fn started(&mut self, name: &str, log: PathBuf) {
-        if let Some(live) = &mut self.live {
-            let line = live.all.add(ProgressBar::new_spinner());
-            line.set_style(style("  {wide_msg}"));
-            line.set_message(format!("{name}: starting"));
-            live.running.push(Running { name: name.to_owned(), log, line });
-        }
+        let Some(live) = &mut self.live else {
+            return output::message(format_args!("{name}: started, see {}", log.display()));
+        };
+        let line = live.all.add(ProgressBar::new_spinner());
+        line.set_style(style("  {wide_msg}"));
+        line.set_message(format!("{name}: starting"));
+        live.running.push(Running { name: name.to_owned(), log, line });
     }
 
     /// Prints how a run ended and removes its live line.

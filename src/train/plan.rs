@@ -9,7 +9,6 @@ use tandem_rl::config::Recipe;
 use tandem_worker::ServedTask;
 use toml::Value;
 
-use super::environment_file;
 use super::teacher_file::{TeacherFile, path_of_new_run};
 use crate::cli::{EnvironmentArgs, RecipeName, RecordingArgs, TrainArgs, chosen_task};
 use crate::columns::wrapped;
@@ -17,7 +16,9 @@ use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_directory::RUNS;
 use crate::service::worker_failed;
 use crate::shell::shell_word;
-use crate::{dashboard, output, policy_file, run_directory, run_file, served_task};
+use crate::{
+    dashboard, environment_file, output, policy_file, run_directory, run_file, served_task,
+};
 
 /// A run that can be started.
 pub(crate) struct Plan {

@@ -12,6 +12,7 @@ use crate::cli::{EnvironmentArgs, TrainArgs};
 use crate::environment_server::names_server;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
+use crate::shell::shell_text;
 
 /// The options of the server, by their names on the command line.
 #[derive(Debug, Default, Deserialize, Serialize)]
@@ -30,7 +31,7 @@ struct EnvironmentFile {
 }
 
 /// Returns the options of the command line. A resumed run without a server on the command line has its former one.
-pub(super) fn environment_of(args: &TrainArgs) -> Result<EnvironmentArgs, Failed> {
+pub(crate) fn environment_of(args: &TrainArgs) -> Result<EnvironmentArgs, Failed> {
     let given = args.environment.clone();
     let path = args.out.as_deref().filter(|_| args.resume).map(path_in);
     let Some(path) = path.filter(|path| !names_server(&given) && path.exists()) else {
@@ -46,7 +47,7 @@ pub(super) fn environment_of(args: &TrainArgs) -> Result<EnvironmentArgs, Failed
 
 /// Writes the options to the run directory `out`, unless they are stored there. Options that name no server remove
 /// those of an earlier run.
-pub(super) fn keep(args: &EnvironmentArgs, out: &Path) -> Result<(), Failed> {
+pub(crate) fn keep(args: &EnvironmentArgs, out: &Path) -> Result<(), Failed> {
     let path = path_in(out);
     let what = || format!("cannot write {}", path.display());
     if !names_server(args) {
@@ -60,6 +61,13 @@ pub(super) fn keep(args: &EnvironmentArgs, out: &Path) -> Result<(), Failed> {
     }
     let text = toml::to_string(&EnvironmentFile::from(args)).or_exit(Exit::Usage, what)?;
     atomic_file::replace(&path, text.as_bytes()).or_cannot_write(what)
+}
+
+/// Returns the option with the server of the run in `out`, as a shell takes it, if the run remembers one.
+pub(crate) fn server_option(out: &Path) -> Option<String> {
+    let args = read(&path_in(out)).ok()?;
+    let command = args.env_command.map(|command| format!("--env-command {}", shell_text(command)));
+    command.or_else(|| Some(format!("--env {}", shell_text(args.env?))))
 }
 
 fn path_in(out: &Path) -> PathBuf {
@@ -116,6 +124,11 @@ mod tests {
         for args in [command, address] {
             keep(&args, out.path()).expect("writes");
             assert_eq!(read(&path).expect("complete"), args);
+            let option = server_option(out.path()).expect("a server");
+            assert!(match args.env_command {
+                Some(_) => option == r#"--env-command 'serve --name "it'\''s" | tee log'"#,
+                None => option == "--env https://lab:7005",
+            });
         }
         let none = EnvironmentArgs::default();
         keep(&none, out.path()).expect("removes");
