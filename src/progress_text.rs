@@ -77,7 +77,9 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
     let mut lines =
         vec![format!("best success {best}; training success {:.2}", progress.training_success)];
     lines.extend(advice_text(progress).map(|advice| format!("advice {advice}")));
-    lines.push(format!("learner {}; {}", progress.phase, workers_text(progress)));
+    if !progress.phase.is_empty() {
+        lines.push(format!("learner {}; {}", progress.phase, workers_text(progress)));
+    }
     lines
 }
 

@@ -1,8 +1,10 @@
 //! Run directories.
 
+use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
+use serde_json::Value;
 use tandem_system::DirectoryLock;
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -40,14 +42,51 @@ pub(crate) fn saved_round(out: &Path) -> Option<u64> {
     tandem_learner::checkpoint::round_of(checkpoints.last()?)
 }
 
-/// Returns how far the run in `out` is: `complete`, `saved after round 6`, or `not saved yet`.
-pub(crate) fn state(out: &Path) -> String {
-    let Some(round) = saved_round(out) else { return "not saved yet".to_owned() };
-    let is_complete = run_file::resolve(Some(&out.join("run.toml")), &[]).is_ok_and(|run| {
-        let limit = run.stop.max_env_steps;
-        limit > 0 && round * run.env_steps_per_round() >= limit
-    });
-    if is_complete { "complete".to_owned() } else { format!("saved after round {round}") }
+/// How far a run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum RunState {
+    /// Nothing is saved yet.
+    NotSaved,
+    /// The newest checkpoint is that of this round.
+    Saved(u64),
+    /// The run has all its environment steps, but `tandem train` has not tested the result.
+    NotTested,
+    /// The run has ended, and its result is tested.
+    Complete,
+}
+
+impl Display for RunState {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NotSaved => f.write_str("not saved yet"),
+            Self::Saved(round) => write!(f, "saved after round {round}"),
+            Self::NotTested => f.write_str("complete, not tested"),
+            Self::Complete => f.write_str("complete"),
+        }
+    }
+}
+
+/// Returns how far the run in `out` is.
+pub(crate) fn state(out: &Path) -> RunState {
+    let limit = run_file::resolve(Some(&out.join("run.toml")), &[])
+        .map(|run| (run.stop.max_env_steps, run.env_steps_per_round()));
+    // A run that is resumed for longer has the summary of the shorter one until its end.
+    let is_of_length = |summary: &Value| {
+        let of_run = summary.get("max_env_steps").and_then(Value::as_u64);
+        of_run.is_none_or(|of_run| limit.as_ref().is_ok_and(|(limit, _)| *limit == of_run))
+    };
+    let summary = std::fs::read(out.join("summary.json")).ok();
+    let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    if summary.is_some_and(|summary: Value| summary.is_object() && is_of_length(&summary)) {
+        return RunState::Complete;
+    }
+    match (saved_round(out), limit) {
+        (None, _) => RunState::NotSaved,
+        (Some(round), Ok((limit, per_round))) if limit > 0 && round * per_round >= limit => {
+            RunState::NotTested
+        }
+        (Some(round), _) => RunState::Saved(round),
+    }
 }
 
 /// Returns the error about a directory that holds no run to resume, with runs that can be resumed.
@@ -76,6 +115,20 @@ pub(crate) fn runs_in(parent: &Path) -> Vec<PathBuf> {
         directories.filter(|directory| directory.join("run.toml").is_file()).collect();
     runs.sort();
     runs
+}
+
+/// Returns the directories in `parent` that hold the runs of a sweep, with the states of these.
+pub(crate) fn sweeps_in(parent: &Path) -> Vec<(PathBuf, Vec<RunState>)> {
+    let entries = std::fs::read_dir(parent).into_iter().flatten();
+    let directories = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let directories = directories.filter(|directory| !directory.join("run.toml").exists());
+    let states = directories.map(|directory| {
+        let states = runs_in(&directory).iter().map(|run| state(run)).collect::<Vec<_>>();
+        (directory, states)
+    });
+    let mut sweeps: Vec<_> = states.filter(|(_, states)| !states.is_empty()).collect();
+    sweeps.sort_by(|(a, _), (b, _)| a.cmp(b));
+    sweeps
 }
 
 /// Locks a directory; `None` if another process has locked it.

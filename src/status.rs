@@ -1,4 +1,6 @@
-//! `tandem status`: shows the progress of a run, from any machine that can reach its learner.
+//! `tandem status`: shows the progress of a run, from any machine that can reach its learner, or from its directory.
+
+mod recorded;
 
 use std::path::Path;
 use std::time::Duration;
@@ -25,7 +27,11 @@ const LINE_EVERY_S: f64 = 30.0;
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let client_config = access::client_config(&args.client_config, &args.secret)?;
-    let address = address_of(&args.run)?;
+    let address = match source_of(&args.run)? {
+        Source::Learner(address) => address,
+        Source::Recorded => return recorded::show(&args.run, args.json),
+        Source::List => return recorded::list(&args.run, args.json),
+    };
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
         let no_directory = || format!("there is no directory {}", args.run.display());
@@ -50,27 +56,35 @@ struct Learner {
     advice: &'static str,
 }
 
-/// Returns the address of a learner, which is given, or that of the `tandem train` whose run directory is given.
-fn address_of(run: &Path) -> Result<String, Failed> {
+/// Where the progress comes from.
+enum Source {
+    /// The learner at this address.
+    Learner(String),
+    /// The files of a run of which no learner is running.
+    Recorded,
+    /// The runs in a directory.
+    List,
+}
+
+/// Returns the source for the address of a learner, the directory of a run, or one that holds runs.
+fn source_of(run: &Path) -> Result<Source, Failed> {
     if !run.is_dir() {
-        return Ok(run.to_string_lossy().into_owned());
+        return Ok(Source::Learner(run.to_string_lossy().into_owned()));
     }
-    let shown = run.display();
     if !run.join("run.toml").exists() {
-        return Err(run_directory::no_run(&format!("{shown} holds no run")));
+        let has_runs =
+            !run_directory::runs_in(run).is_empty() || !run_directory::sweeps_in(run).is_empty();
+        let none = || run_directory::no_run(&format!("{} holds no run", run.display()));
+        return if has_runs { Ok(Source::List) } else { Err(none()) };
     }
-    let no_learner = || {
-        let state = run_directory::state(run);
-        let what = anyhow!("no learner of a `tandem train` is running in {shown} ({state})");
-        Failed::new(Exit::TryAgain, what)
+    let Ok(address) = std::fs::read_to_string(run_directory::learner_address(run)) else {
+        return Ok(Source::Recorded);
     };
-    let path = run_directory::learner_address(run);
-    let address = std::fs::read_to_string(path).map_err(|_missing| no_learner())?;
     // A `tandem train` that was killed has left the address, at which another program may listen now.
-    match run_directory::lock(run)? {
-        Some(_is_unused) => Err(no_learner()),
-        None => Ok(address.trim().to_owned()),
-    }
+    Ok(match run_directory::lock(run)? {
+        Some(_is_unused) => Source::Recorded,
+        None => Source::Learner(address.trim().to_owned()),
+    })
 }
 
 /// Prints the current progress.

@@ -3,6 +3,8 @@
 mod messages;
 mod refusals;
 
+pub use messages::encode_evaluation;
+
 use std::panic::AssertUnwindSafe;
 use std::path::PathBuf;
 use std::pin::Pin;

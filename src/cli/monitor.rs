@@ -39,14 +39,15 @@ pub(crate) struct HealthArgs {
 Examples:
   tandem status runs/mine          # of a running `tandem train`
   tandem status runs/mine --watch
+  tandem status runs               # lists the runs and sweeps in a directory
   tandem status 127.0.0.1:7000
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json
 
 Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, directory or address, 75 the learner cannot be \
-reached.")]
+reached, or none is running and the run is not complete.")]
 pub(crate) struct StatusArgs {
-    /// Run directory of a `tandem train` on this machine, or address of a learner or relay.
+    /// Run directory of a `tandem train` on this machine, directory that holds runs, or address of a learner or relay.
     #[arg(value_name = "DIR|ADDR")]
     pub(crate) run: PathBuf,
     /// Follows the run until it ends, as `tandem train` shows it: with a progress bar on a terminal, elsewhere with a line for

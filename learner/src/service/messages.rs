@@ -58,7 +58,9 @@ fn encode_worker(worker: &WorkerProgress) -> pb::WorkerProgress {
     }
 }
 
-fn encode_evaluation(row: &MetricsRow) -> pb::Evaluation {
+/// Encodes an evaluation.
+#[must_use]
+pub fn encode_evaluation(row: &MetricsRow) -> pb::Evaluation {
     let contacts = &row.contacts;
     pb::Evaluation {
         round: row.round,

@@ -1,0 +1,142 @@
+//! The status of runs of which no learner is running, from their directories.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::anyhow;
+use serde_json::{Value, json};
+use tandem_learner::service::encode_evaluation;
+use tandem_proto::pb;
+use tandem_report::Run;
+
+use super::lines;
+use crate::exit::{Exit, Failed, OrExit as _};
+use crate::output;
+use crate::progress_json::progress_json;
+use crate::progress_text::grouped;
+use crate::run_directory::{self, RunState};
+use crate::run_file;
+use crate::shell::shell_word;
+
+/// Prints the progress of the run in `dir`, which no learner is working on.
+///
+/// # Errors
+/// After printing, if the run is not complete: nothing works on it.
+pub(super) fn show(dir: &Path, prints_json: bool) -> Result<(), Failed> {
+    let state = run_directory::state(dir);
+    let progress = progress_of(dir, state)?;
+    if prints_json {
+        output::print(progress_json(&progress))?;
+    } else if progress.evaluation.is_some() {
+        lines(&progress).iter().try_for_each(output::print)?;
+    }
+    if state == RunState::Complete {
+        return Ok(());
+    }
+    let (shown, word) = (dir.display(), shell_word(dir));
+    let what = anyhow!(
+        "no learner of a `tandem train` is running in {shown} ({state}); `tandem train --resume --out {word}` resumes it"
+    );
+    Err(Failed::new(Exit::TryAgain, what))
+}
+
+/// Prints a line for each run in `parent`, and one for each sweep.
+pub(super) fn list(parent: &Path, prints_json: bool) -> Result<(), Failed> {
+    let runs: Vec<Listed> = run_directory::runs_in(parent).into_iter().map(Listed::read).collect();
+    let sweeps = run_directory::sweeps_in(parent);
+    if prints_json {
+        let sweeps: Vec<Value> = sweeps.iter().map(sweep_json).collect();
+        let runs: Vec<Value> = runs.iter().map(Listed::json).collect();
+        return output::print(json!({"runs": runs, "sweeps": sweeps}));
+    }
+    let width = |texts: &mut dyn Iterator<Item = usize>| texts.max().unwrap_or(0);
+    let name_width = width(&mut runs.iter().map(|run| run.path.display().to_string().len()));
+    let state_width = width(&mut runs.iter().map(|run| run.state.len()));
+    for run in &runs {
+        let (path, state, result) = (run.path.display().to_string(), &run.state, run.result());
+        let line = format!("{path:name_width$}  {state:state_width$}  {result}");
+        output::print(line.trim_end())?;
+    }
+    for (path, states) in &sweeps {
+        let n_complete = states.iter().filter(|state| **state == RunState::Complete).count();
+        let (shown, n) = (path.display(), states.len());
+        output::print(format_args!("{shown}: a sweep, {n_complete} of {n} runs complete"))?;
+    }
+    Ok(())
+}
+
+fn sweep_json((path, states): &(PathBuf, Vec<RunState>)) -> Value {
+    let n_complete = states.iter().filter(|state| **state == RunState::Complete).count();
+    json!({"directory": path.to_string_lossy(), "n_runs": states.len(), "n_complete": n_complete})
+}
+
+/// A run of a list.
+struct Listed {
+    path: PathBuf,
+    state: String,
+    latest: Option<pb::Evaluation>,
+}
+
+impl Listed {
+    fn read(path: PathBuf) -> Self {
+        let is_running = matches!(run_directory::lock(&path), Ok(None));
+        let state = match is_running {
+            true => "running".to_owned(),
+            false => run_directory::state(&path).to_string(),
+        };
+        let run = Run::load(&path, &mut Vec::new()).unwrap_or_default();
+        let latest = run.last().map(encode_evaluation);
+        Self { path, state, latest }
+    }
+
+    /// Returns the latest evaluation; nothing before the first.
+    fn result(&self) -> String {
+        self.latest.as_ref().map_or_else(String::new, |latest| {
+            format!("{} env steps, success {:.3}", grouped(latest.env_steps), latest.success)
+        })
+    }
+
+    fn json(&self) -> Value {
+        let latest = self.latest.as_ref();
+        json!({
+            "directory": self.path.to_string_lossy(), "state": self.state,
+            "env_steps": latest.map(|latest| latest.env_steps),
+            "success": latest.map(|latest| latest.success),
+            "success_without_contact": latest.and_then(|latest| latest.success_without_contact),
+        })
+    }
+}
+
+/// Returns the progress of a run at its last evaluation.
+fn progress_of(dir: &Path, state: RunState) -> Result<pb::Progress, Failed> {
+    let config = run_file::resolve(Some(&dir.join("run.toml")), &[])?;
+    let mut warnings = Vec::new();
+    let run = match dir.join("metrics.jsonl").exists() {
+        true => Run::load(dir, &mut warnings).or_exit(Exit::Data, String::new)?,
+        false => Run::default(),
+    };
+    warnings.iter().for_each(output::message);
+    let mut progress = pb::Progress {
+        task: config.task.to_string(),
+        n_arms: u32::try_from(config.arms).unwrap_or(u32::MAX),
+        strategy: config.advice.strategy.to_string(),
+        best: run.best().map(encode_evaluation),
+        evaluation: run.last().map(encode_evaluation),
+        ended: state == RunState::Complete,
+        end_reason: state.to_string(),
+        max_env_steps: config.stop.max_env_steps,
+        max_minutes: config.stop.max_minutes,
+        ..Default::default()
+    };
+    if let Some(last) = run.last() {
+        progress.round = last.round;
+        progress.env_steps = last.env_steps;
+        progress.episodes = last.episodes;
+        progress.updates = last.updates;
+        progress.wall_s = last.wall_s;
+        progress.advice_spent = last.advice_spent;
+        progress.advice_queries = last.advice_queries;
+        progress.budget_left = last.budget_left;
+        progress.training_success = last.training_success;
+    }
+    Ok(progress)
+}
