@@ -16,6 +16,7 @@ use crate::input;
 use former::{current_keys, is_removed, with_added};
 
 mod former;
+mod other_names;
 
 /// The section that describes a task which is not built-in. It is one value: its keys are no settings of their own.
 const DESCRIPTION: &str = "description";
@@ -286,9 +287,10 @@ fn merge(base: &mut Table, changes: &Table, path: &str, known: &[String]) -> any
         let name = dotted(path, key);
         let siblings = || base.keys().cloned().collect::<Vec<_>>().join(", ");
         if !base.contains_key(key) {
-            let hint = match nearest(&name, known) {
-                Some(near) => format!("did you mean {near:?}?"),
-                None => format!("expected one of {}", siblings()),
+            let hint = match (other_names::meaning(&name), nearest(&name, known)) {
+                (Some(settings), _) => format!("here it is {settings}"),
+                (None, Some(near)) => format!("did you mean {near:?}?"),
+                (None, None) => format!("expected one of {}", siblings()),
             };
             bail!("unknown setting {:?}: {hint}", shortened(&name));
         }

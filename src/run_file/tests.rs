@@ -87,6 +87,8 @@ fn errors_name_the_setting() {
     check("ddpg.discount=inf", &["ddpg.discount", "inf", "[0, 1)"]);
     check("ddpg.discount=", &["ddpg.discount", "\"\"", "number"]);
     check("discount=0.9", &["discount", "did you mean \"ddpg.discount\"?"]);
+    check("ddpg.gamma=0.9", &["\"ddpg.gamma\": here it is ddpg.discount"]);
+    check("learning_starts=9", &["here it is rounds.warmup_env_steps"]);
     check("ddpg.epochs=3", &["ddpg.epochs", "batch_size"]);
     check("ddpg.discount.x=1", &["ddpg.discount", "number"]);
     check("ddpg={ discount = 0.5 }", &["ddpg", "section"]);
