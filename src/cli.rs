@@ -7,6 +7,7 @@ use crate::version::VERSION;
 mod bench;
 mod bridge;
 mod monitor;
+mod number;
 mod policy;
 mod recording;
 mod results;

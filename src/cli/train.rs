@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use super::number::whole;
 use super::{EnvironmentArgs, LiveArgs, MetricsArgs, RecordingArgs, TaskName, WorldName};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -14,6 +15,13 @@ pub(crate) enum RecipeName {
     /// The paper's DDPG + HER, with the reference implementation's values where the paper gives none; takes hours.
     Paper,
 }
+
+const TASK: &str = "Task";
+const ADVICE: &str = "Advice";
+const END_OF_THE_RUN: &str = "End of the run";
+const SETTINGS: &str = "Settings";
+const PROCESSES: &str = "Processes";
+const OUTPUT: &str = "Run directory and output";
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -46,94 +54,94 @@ Examples:
       # resumes it for longer")]
 pub(crate) struct TrainArgs {
     /// Task [default: push].
-    #[arg(long, value_parser = TaskName::parser())]
+    #[arg(long, help_heading = TASK, value_parser = TaskName::parser())]
     pub(crate) task: Option<TaskName>,
     /// World of the task: classic (fast arms, adjacent areas) or shared (slow arms, one area) [default: shared].
-    #[arg(long, value_enum, hide_possible_values = true)]
+    #[arg(long, help_heading = TASK, value_enum, hide_possible_values = true)]
     pub(crate) world: Option<WorldName>,
     /// Number of arms of the trained policy, 1 or 2 [default: 2].
-    #[arg(long)]
+    #[arg(long, help_heading = TASK)]
     pub(crate) arms: Option<usize>,
     /// Advising strategy: none, ea, eamc:T, mc-q:T, mc-act:A, mc-act-abs:A, jsrl:H (the teacher acts on at most the
     /// first H steps), rlif:T (as mc-q:T, and interventions lower the reward) or ts2c:T (asks
     /// where critics disagree). With init:teacher the student starts as
     /// copies of the teacher and gets no advice
     /// [default: none with one arm; mc-q:0.4 in pick-and-place of world shared with recipe tandem, else mc-q:0.1].
-    #[arg(long, value_name = "NAME[:THRESHOLD]")]
+    #[arg(long, help_heading = ADVICE, value_name = "NAME[:THRESHOLD]")]
     pub(crate) strategy: Option<String>,
     /// Policy file of the teacher, a run directory for the best policy of the run, the ONNX model of an actor (*.onnx),
     /// or http://HOST:PORT of a server of tandem.v1.Policy without a token [default: the shipped teacher of the task].
     /// With --recipe paper it should be a teacher of that recipe; otherwise a message says so.
-    #[arg(long, value_name = "FILE|DIR|URL")]
+    #[arg(long, help_heading = ADVICE, value_name = "FILE|DIR|URL")]
     pub(crate) teacher: Option<PathBuf>,
     /// ONNX model of the teacher's critic. Without it, strategies that compare values cannot be used.
-    #[arg(long, value_name = "FILE.onnx", requires = "teacher")]
+    #[arg(long, help_heading = ADVICE, value_name = "FILE.onnx", requires = "teacher")]
     pub(crate) teacher_critic: Option<PathBuf>,
     /// Advice budget, in environment steps with advice; with --recipe paper in lock steps of each slot
     /// (advice.budget_scope, advice.unit) [default: 500000].
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = ADVICE, value_name = "N", value_parser = whole)]
     pub(crate) budget: Option<u64>,
     /// Number of worker processes [default: one per core, at most one per slot].
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = PROCESSES, value_name = "N")]
     pub(crate) workers: Option<usize>,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Environments of another process")]
     pub(crate) environment: EnvironmentArgs,
     /// Seed of all random numbers [default: 1].
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = SETTINGS, value_name = "N")]
     pub(crate) seed: Option<u64>,
     /// Stops when an evaluation reaches this success rate, 0 to 1.
-    #[arg(long, value_name = "P")]
+    #[arg(long, help_heading = END_OF_THE_RUN, value_name = "P")]
     pub(crate) until_success: Option<f64>,
     /// Stops after this many environment steps; 0 for no limit [default: the recipe's, none with --max-minutes].
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = END_OF_THE_RUN, value_name = "N", value_parser = whole)]
     pub(crate) max_env_steps: Option<u64>,
     /// Stops after this many minutes, those before --resume included; 0 for no limit. A resumed run keeps its other limit.
-    #[arg(long, value_name = "N")]
+    #[arg(long, help_heading = END_OF_THE_RUN, value_name = "N")]
     pub(crate) max_minutes: Option<f64>,
     /// Recipe that gives the defaults of all settings [default: tandem].
-    #[arg(long, value_enum)]
+    #[arg(long, help_heading = SETTINGS, value_enum)]
     pub(crate) recipe: Option<RecipeName>,
     /// Run file (TOML) with any of the settings; unknown keys are rejected.
-    #[arg(long, value_name = "FILE.toml")]
+    #[arg(long, help_heading = SETTINGS, value_name = "FILE.toml")]
     pub(crate) run: Option<PathBuf>,
     /// Overrides one setting, for example ddpg.discount=0.98; can be repeated.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
+    #[arg(long = "set", help_heading = SETTINGS, value_name = "KEY=VALUE")]
     pub(crate) settings: Vec<String>,
     /// Prints every setting with its meaning, its range and its values under both recipes, for all tasks and numbers of
     /// arms, and starts nothing. --print-run prints the values of one run.
-    #[arg(long = "settings", conflicts_with_all = [
+    #[arg(long = "settings", help_heading = SETTINGS, conflicts_with_all = [
         "task", "world", "arms", "strategy", "teacher", "budget", "env", "env_command", "seed", "until_success",
         "max_env_steps", "max_minutes", "recipe", "run", "settings", "print_run", "out", "resume"])]
     pub(crate) list_settings: bool,
     /// Prints the run file of the other options, with every setting, and starts no run; --run takes it. Teacher, workers
     /// and environments are no settings: name them again. --env and --env-command are asked for their task.
-    #[arg(long, conflicts_with_all = ["resume", "json"])]
+    #[arg(long, help_heading = SETTINGS, conflicts_with_all = ["resume", "json"])]
     pub(crate) print_run: bool,
     /// Run directory [default: runs/TASK-ARMS-STRATEGY-seedN].
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, help_heading = OUTPUT, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Logs of episodes")]
     pub(crate) recording: RecordingArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Logs of episodes")]
     pub(crate) live: LiveArgs,
     /// Resumes the run in --out from its newest checkpoint. Settings and teacher remain those of the run, and so does the
     /// server of its environments unless --env or --env-command names another one. Only
     /// its end (--max-env-steps, --max-minutes, --until-success), checkpoint.*, evaluation.early_points,
     /// evaluation.recorded_episodes, evaluation.test_episodes and --workers can change. A rejected --resume changes nothing.
-    #[arg(long)]
+    #[arg(long, help_heading = OUTPUT)]
     pub(crate) resume: bool,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Monitoring")]
     pub(crate) dashboard: DashboardArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Monitoring")]
     pub(crate) metrics: MetricsArgs,
     /// Prints the summary as one JSON object on the last line of standard output.
-    #[arg(long)]
+    #[arg(long, help_heading = OUTPUT)]
     pub(crate) json: bool,
     /// Prints every message about the progress as one JSON object per line of standard output, before the summary.
     #[arg(long, hide = true, requires = "json")]
     pub(crate) progress_json: bool,
     /// Prints no progress: only the summary, warnings and errors.
-    #[arg(long, short)]
+    #[arg(long, help_heading = OUTPUT, short)]
     pub(crate) quiet: bool,
     /// Interrupts the run when standard input closes, which happens when the parent process dies.
     #[arg(long, hide = true)]
