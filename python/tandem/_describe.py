@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from tandem._failures import Raised
 from tandem._grpc import ServiceError
 from tandem._task import Arm, Manipulation, Norm, Reflection, Task, distance
 
@@ -52,6 +53,10 @@ class TaskOptions:
         return cls(**{**own, **{name: value for name, value in given.items() if value is not None}})
 
 
+class UnusableEnvironment(ServiceError):
+    """An environment that raised an exception, which is the cause."""
+
+
 @contextlib.contextmanager
 def environment_errors() -> Iterator[None]:
     """Converts the errors of an environment that cannot be used to `ServiceError`."""
@@ -60,7 +65,7 @@ def environment_errors() -> Iterator[None]:
     except ServiceError:
         raise
     except (Exception, SystemExit) as error:  # Environments raise errors of their own.
-        raise ServiceError(f"the environment cannot be used: {type(error).__name__}: {error}") from error
+        raise UnusableEnvironment(f"the environment cannot be used: {Raised.of(error).text}") from error
 
 
 def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, bool]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tandem._describe import TaskOptions, describe, environment_errors
+from tandem._failures import Raised, Tracebacks
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._gym import EnvFn, GymEnvironment, InvalidEpisode, contact_bits, first_outside, make
 from tandem._proto import environment_pb2, environment_pb2_grpc
@@ -78,12 +79,14 @@ class _Environments:
 
 
 class EnvironmentFailure(Exception):
-    """An exception of an environment, with its text."""
+    """An exception of an environment, with its text. A process sends it to the server by pickling it."""
 
-    def __init__(self, text: str, *, is_final: bool = False) -> None:
+    def __init__(self, text: str, *, is_final: bool = False, raised: Raised | None = None) -> None:
         super().__init__(text)
         self.is_final = is_final
         """Whether the same episode would fail again."""
+        self.raised = raised
+        """The exception, unless the environment broke a rule of episodes."""
 
 
 @contextlib.contextmanager
@@ -93,7 +96,8 @@ def _named(index: int) -> Iterator[None]:
     except InvalidEpisode as error:
         raise EnvironmentFailure(f"environment {index}: {error}", is_final=True) from error
     except (Exception, SystemExit) as error:
-        raise EnvironmentFailure(f"environment {index}: {type(error).__name__}: {error}") from error
+        raised = Raised.of(error)
+        raise EnvironmentFailure(f"environment {index}: {raised.text}", raised=raised) from error
 
 
 def _serve_pipe(pipe: Any, pickled: bytes) -> None:
@@ -108,7 +112,7 @@ def _serve_pipe(pipe: Any, pickled: bytes) -> None:
             try:
                 pipe.send((True, getattr(environments, method)(argument)))
             except EnvironmentFailure as error:
-                pipe.send((False, (str(error), error.is_final)))
+                pipe.send((False, error))
     environments.close()
 
 
@@ -169,7 +173,7 @@ class _ProcessPool:
         for position, (index, _) in enumerate(items):
             shares.setdefault(index % len(self._pipes), []).append(position)
         answers: list[Any] = [None] * len(items)
-        failure = None
+        failure: EnvironmentFailure | None = None
         try:
             for number, share in shares.items():
                 self._pipes[number].send((method, [items[position] for position in share]))
@@ -183,8 +187,7 @@ class _ProcessPool:
         except (EOFError, OSError) as error:
             raise EnvironmentFailure("a process of the environments ended unexpectedly") from error
         if failure is not None:
-            text, is_final = failure
-            raise EnvironmentFailure(text, is_final=is_final)
+            raise failure
         return answers
 
 
@@ -276,6 +279,7 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
         self._n = n
         self._room = threading.Semaphore(max_streams)
         self._max_streams = max_streams
+        self._tracebacks = Tracebacks()
 
     def Describe(self, request: Any, context: Any) -> environment_pb2.EnvironmentDescription:
         return environment_pb2.EnvironmentDescription(
@@ -291,6 +295,7 @@ class _Servicer(environment_pb2_grpc.EnvironmentServicer):
         except Refused as error:
             context.abort(error.code, str(error))
         except EnvironmentFailure as error:
+            self._tracebacks.print(error, error.raised)
             code = grpc.StatusCode.DATA_LOSS if error.is_final else grpc.StatusCode.INTERNAL
             context.abort(code, str(error))
         except grpc.RpcError:

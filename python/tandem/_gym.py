@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from tandem._failures import is_in_own_code
 from tandem._grpc import ServiceError
 from tandem._task import Floats, Task, distance
 from tandem.panda import corrected
@@ -42,6 +43,8 @@ def _make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
     except (gymnasium.error.UnregisteredEnv, ImportError) as error:
         raise ServiceError(f"no environment {name!r}: {error}; MODULE:ID imports a module first") from error
     except (gymnasium.error.Error, TypeError, ValueError) as error:
+        if is_in_own_code(error):
+            raise
         raise ServiceError(f"cannot create environment {name!r}: {error}") from error
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tandem._environments import check_actions, decode_floats, run
+from tandem._failures import Raised, Tracebacks
 from tandem._grpc import Path, Refused, Server, ServiceError, grpc
 from tandem._gym import ACTION_SLACK
 from tandem._proto import policy_pb2, policy_pb2_grpc
@@ -44,7 +45,11 @@ def _functions(policy: Policy) -> tuple[PolicyFn, ValueFn | None]:
 
 
 class PolicyFailure(Exception):
-    """An exception of a policy, or an answer of it that cannot be used."""
+    """An exception of a policy, which is `raised`, or an answer of it that cannot be used."""
+
+    def __init__(self, text: str, raised: Raised | None = None) -> None:
+        super().__init__(text)
+        self.raised = raised
 
 
 class _Policy:
@@ -86,7 +91,8 @@ class _Policy:
             try:
                 answer = np.asarray(function(*rows), np.float32)
             except Exception as error:
-                raise PolicyFailure(f"{name} raised {type(error).__name__}: {error}") from error
+                raised = Raised.of(error)
+                raise PolicyFailure(f"{name} raised {raised.text}", raised) from error
             if answer.size != n * int(np.prod(shape)) or answer.shape[:1] != (n,):
                 expected = list((n, *shape))
                 raise PolicyFailure(f"{name} returned an array of shape {list(answer.shape)}, expected {expected}")
@@ -130,6 +136,7 @@ class _Servicer(policy_pb2_grpc.PolicyServicer):
         self._name = name
         self._digest = digest
         self._lock = threading.Lock()  # Policies need not be thread-safe.
+        self._tracebacks = Tracebacks()
 
     def Describe(self, request: Any, context: Any) -> policy_pb2.PolicyDescription:
         return policy_pb2.PolicyDescription(
@@ -146,6 +153,7 @@ class _Servicer(policy_pb2_grpc.PolicyServicer):
         except Refused as error:
             context.abort(error.code, str(error))
         except PolicyFailure as error:
+            self._tracebacks.print(error, error.raised)
             context.abort(grpc.StatusCode.INTERNAL, str(error))
         raise AssertionError("abort raises")
 

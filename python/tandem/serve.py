@@ -6,11 +6,12 @@ import argparse
 import contextlib
 import json
 import sys
+import traceback
 from typing import Any, NoReturn
 
 from tandem._environments import LISTEN_VARIABLE, serve
 from tandem._grpc import ServiceError
-from tandem._describe import DEFAULT_BOUND
+from tandem._describe import DEFAULT_BOUND, UnusableEnvironment
 from tandem._fetch import FETCH_REFLECTION
 from tandem._task import Arm, ArmManipulation, Condition, Manipulation, Reflection
 
@@ -159,6 +160,8 @@ def main() -> int:
     try:
         serve((env, kwargs), **arguments)
     except ServiceError as error:
+        if isinstance(error, UnusableEnvironment):
+            traceback.print_exception(error.__cause__)
         print(f"tandem.serve: {error}", file=sys.stderr)
         return 64
     return 0

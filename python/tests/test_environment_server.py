@@ -157,14 +157,25 @@ def test_malformed_requests_are_refused_by_field(client: Client) -> None:
         assert client.refusal(requests) == ("INVALID_ARGUMENT", message)
 
 
-def test_faults_of_environments_are_reported_with_their_text() -> None:
+def place_of(statement: str) -> str:
+    """Returns file and line of a statement of `goal_env`."""
+    lines = Path(goal_env.__file__).read_text().splitlines()
+    (number,) = (number for number, line in enumerate(lines, 1) if line.strip() == statement)
+    return f"goal_env.py:{number}"
+
+
+FIRE = place_of('raise RuntimeError("the motor is on fire")')
+GONE = place_of('raise SystemExit("the motor is gone")')
+
+
+def test_faults_of_environments_are_reported_with_their_text_and_place() -> None:
     """The probe plays 10 steps, so the environment fails at step 11."""
     requests = [reset([(0, 1), (1, 2)]), *[step(np.zeros((2, 2))) for _ in range(11)]]
     for workers in (1, 2):
         with tandem.EnvironmentServer((ID, {"fails_at": 11}), workers=workers) as server:
             client = Client(server)
             for _ in range(2):
-                expected = "environment 0: RuntimeError: the motor is on fire"
+                expected = f"environment 0: RuntimeError: the motor is on fire ({FIRE})"
                 assert client.refusal(requests) == ("INTERNAL", expected)
             assert len(client.play(requests[:-1])) == 11
     with tandem.EnvironmentServer((ID, {"terminates_at": 11})) as server:
@@ -180,7 +191,33 @@ def test_faults_of_environments_are_reported_with_their_text() -> None:
             with tandem.EnvironmentServer((ID, {argument: 11}), workers=workers) as server:
                 assert Client(server).refusal(requests) == ("DATA_LOSS", expected)
     with tandem.EnvironmentServer((ID, {"exits_at": 11})) as server:
-        assert Client(server).refusal(requests) == ("INTERNAL", "environment 0: SystemExit: the motor is gone")
+        expected = f"environment 0: SystemExit: the motor is gone ({GONE})"
+        assert Client(server).refusal(requests) == ("INTERNAL", expected)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_log_has_one_traceback_for_each_place(workers: int, capsys: pytest.CaptureFixture[str]) -> None:
+    requests = [reset([(0, 1)]), *[step(np.zeros((1, 2)))] * 11]
+    with tandem.EnvironmentServer((ID, {"fails_at": 11}), workers=workers) as server:
+        for _ in range(3):
+            Client(server).refusal(requests)
+    log = capsys.readouterr().err
+    assert log.startswith(f"environment 0: RuntimeError: the motor is on fire ({FIRE})\nTraceback "), log
+    number = FIRE.partition(":")[2]
+    assert log.count("Traceback ") == 1 and f'goal_env.py", line {number}, in step' in log, log
+    with tandem.EnvironmentServer((ID, {"nan_at": 11}), workers=workers) as server:
+        assert Client(server).refusal(requests)[0] == "DATA_LOSS"
+    assert capsys.readouterr().err == "", "a broken rule has no traceback"
+
+
+def test_an_error_in_a_constructor_is_reported_with_its_place() -> None:
+    def broken() -> Any:
+        return len(5)  # type: ignore[arg-type]
+
+    gymnasium.register("Tandem/Broken-v0", broken)
+    expected = r"cannot be used: TypeError: .* has no len.* \(test_environment_server.py:\d+\)"
+    with pytest.raises(tandem.ServiceError, match=expected):
+        tandem.EnvironmentServer("Tandem/Broken-v0")
 
 
 def test_a_run_ends_when_an_environment_terminates_without_its_goal(tmp_path: Path) -> None:
@@ -402,6 +439,14 @@ def test_the_command_reports_an_unusable_environment_in_one_line() -> None:
     code, errors = Command(ID, "--kwargs", '{"dense": true}').end()
     assert code == 64
     assert errors.startswith("tandem.serve: the reward is not sparse") and errors.count("\n") == 1, errors
+
+
+def test_the_command_reports_an_exception_of_the_environment_with_its_traceback() -> None:
+    code, errors = Command(ID, "--kwargs", '{"fails_at": 3}').end()
+    first, *_, last = errors.splitlines()
+    assert (code, first) == (64, "Traceback (most recent call last):")
+    expected = f"the environment cannot be used: RuntimeError: the motor is on fire ({FIRE})"
+    assert last == f"tandem.serve: {expected}" and "goal_env.py\", line" in errors, errors
 
 
 def test_fetch_push_is_served_with_its_bits() -> None:

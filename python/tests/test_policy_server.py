@@ -137,9 +137,11 @@ def test_requests_are_validated():
         assert refused(server, m=257)[1] == "observations: expected at most 256 states, got 257"
 
 
-def test_a_failing_policy_is_reported_and_the_server_goes_on():
+def test_a_failing_policy_is_reported_and_the_server_goes_on(capsys):
+    singular = "the policy raised LinAlgError: Singular matrix (test_policy_server.py:"
     faults = {
-        "raise": (lambda: 1 / 0, "the policy raised ZeroDivisionError: division by zero"),
+        "raise": (lambda: 1 / 0, "the policy raised ZeroDivisionError: division by zero (test_policy_server.py:"),
+        "package": (lambda: np.linalg.inv(np.zeros((1, 1))), singular),
         "shape": (lambda: np.zeros((1, 4)), "the policy returned an array of shape [1, 4], expected [1, 3]"),
         "range": (lambda: np.full((1, 3), 1.5), "the policy returned 1.5, expected numbers in [-1, 1]"),
         "nan": (lambda: np.full((1, 3), np.nan), "the policy returned nan, expected numbers in [-1, 1]"),
@@ -154,6 +156,10 @@ def test_a_failing_policy_is_reported_and_the_server_goes_on():
             fault[:] = [name]
             code, details = refused(server)
             assert code == "INTERNAL" and details.startswith(message), details
+            assert refused(server) == (code, details)
+            log = capsys.readouterr().err
+            assert log.count("Traceback ") == (name in ("raise", "package")), log
+            assert not log or log.startswith(details) and "test_policy_server.py\", line" in log, log
             fault.clear()
             assert len(evaluate(server).actions) == 36
 
