@@ -251,12 +251,15 @@ def _tolerance(env: gymnasium.Env[Any, Any], samples: list[_Sample]) -> float:
     compute_reward = _attribute(env, "compute_reward")
     if threshold is not None or compute_reward is None:
         return float(threshold or 0.0)
+    for sample in samples:
+        goals = sample.observation["achieved_goal"], sample.observation["desired_goal"]
+        _sparse_reward(compute_reward, *goals, sample.info)
     achieved = samples[0].observation["achieved_goal"].astype(np.float64)
 
     def is_achieved(distance: float) -> bool:
         desired = achieved.copy()
         desired[0] += distance
-        return float(compute_reward(achieved, desired, samples[0].info)) == 0.0
+        return _sparse_reward(compute_reward, achieved, desired, samples[0].info) == 0.0
 
     low, high = 0.0, 1e-6
     while is_achieved(high) and high < 1e6:
@@ -307,19 +310,25 @@ def _checked_norm(
         raise ServiceError(f"the tolerance must be a positive number, not {tolerance}")
     rewards = []
     for achieved, desired, info in _goal_pairs(samples, tolerance):
-        reward = float(compute_reward(achieved, desired, info))
-        if reward not in (-1.0, 0.0):
-            raise ServiceError(
-                f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0 "
-                "(many environments take reward_type=\"sparse\")"
-            )
-        rewards.append((achieved, desired, reward))
+        rewards.append((achieved, desired, _sparse_reward(compute_reward, achieved, desired, info)))
     norms: list[Norm] = ["euclidean", "maximum"] if given is None else [given]
     refusals = [_disagreement(norm, tolerance, rewards) for norm in norms]
     for norm, refusal in zip(norms, refusals):
         if refusal is None:
             return norm
     raise ServiceError(str(refusals[0]))
+
+
+def _sparse_reward(
+    compute_reward: Any, achieved: NDArray[Any], desired: NDArray[Any], info: dict[str, Any]
+) -> float:
+    reward = float(compute_reward(achieved, desired, info))
+    if reward not in (-1.0, 0.0):
+        raise ServiceError(
+            f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0 "
+            "(many environments take reward_type=\"sparse\")"
+        )
+    return reward
 
 
 def _goal_pairs(

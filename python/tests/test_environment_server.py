@@ -471,6 +471,20 @@ def test_a_tolerance_that_the_environment_does_not_name_is_measured() -> None:
     assert (task.tolerance, task.norm, task.name) == (0.175, "euclidean", "pointenv")
 
 
+@pytest.mark.parametrize(
+    ("reward", "returned"),
+    [(lambda apart: -apart, r"-\d\.\d+"), (lambda apart: float(apart <= 0.25), "1")],
+    ids=["a dense reward of a sample, not of the first distance tried", "1 or 0"],
+)
+def test_another_reward_is_refused_before_its_tolerance_is_measured(reward: Any, returned: str) -> None:
+    env = PointEnv()
+    del env.distance_threshold
+    env.compute_reward = lambda a, b, info: reward(np.linalg.norm(a - b))  # type: ignore[method-assign]
+    expected = f"the reward is not sparse: compute_reward returned {returned}, expected -1 or 0"
+    with pytest.raises(tandem.ServiceError, match=expected):
+        describe(env, TaskOptions(episode_steps=5))
+
+
 def test_the_packages_own_environments_can_be_served() -> None:
     with tandem.EnvironmentServer("tandem/TwoArmPush-v0", norm="euclidean") as server:
         task = server.task
