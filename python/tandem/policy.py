@@ -41,6 +41,21 @@ class Policy:
         return self._native.n_arms
 
     @property
+    def n_observation(self) -> int:
+        """Length of an observation."""
+        return self._native.n_observation
+
+    @property
+    def n_goal(self) -> int:
+        """Length of a goal."""
+        return self._native.n_goal
+
+    @property
+    def n_action(self) -> int:
+        """Length of an action."""
+        return self._native.n_action
+
+    @property
     def env_id(self) -> str:
         """Name of the environment with the policy's task, for `gymnasium.make`.
 

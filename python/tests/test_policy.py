@@ -103,6 +103,7 @@ def test_properties_come_from_the_file():
     path = ROOT / "policies/student-pick-and-place-classic.safetensors"
     policy = tandem.load_policy(path)
     assert (policy.task, policy.n_arms, policy.env_id) == ("pick-and-place", 2, "tandem/TwoArmPickAndPlace-v0")
+    assert (policy.n_observation, policy.n_goal, policy.n_action) == (56, 6, 8)
     shared = tandem.load_policy(ROOT / "policies/teacher-push.safetensors")
     assert (shared.task, shared.n_arms, shared.env_id) == ("shared-push", 1, "tandem/SharedPush-v0")
     bar = tandem.load_policy(ROOT / "policies/student-carry-bar.safetensors")
