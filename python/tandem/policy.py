@@ -105,6 +105,8 @@ class Policy:
             deterministic: Has no effect.
 
         Raises:
+            TypeError: The observation is no mapping.
+            KeyError: An array is missing.
             ValueError: An array has another shape or contains a number that is not finite.
         """
         observations, goals, is_batch = self._inputs(observation)
@@ -121,6 +123,8 @@ class Policy:
             action: Actions in [-1, 1], shape `[n_action]` or `[batch, n_action]`.
 
         Raises:
+            TypeError: The observation is no mapping.
+            KeyError: An array of the observation is missing.
             ValueError: The policy has no critic, or an array has another shape or contains a number that is not finite.
         """
         observations, goals, is_batch = self._inputs(observation)
@@ -140,6 +144,12 @@ class Policy:
         return TorchPolicy(self)
 
     def _inputs(self, observation: Mapping[str, ArrayLike]) -> tuple[_Floats, _Floats, bool]:
+        expected_keys = 'a mapping with "observation" and "desired_goal"'
+        if not isinstance(observation, Mapping):
+            raise TypeError(f"the observation is of type {type(observation).__name__}, expected {expected_keys}")
+        for key in ("observation", "desired_goal"):
+            if key not in observation:
+                raise KeyError(f"the observation has no {key}, expected {expected_keys}")
         is_batch = np.ndim(observation["observation"]) > 1
         observations = _rows(observation["observation"])
         expected = (len(observations), self._native.n_observation)

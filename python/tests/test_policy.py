@@ -128,6 +128,19 @@ def test_wrong_inputs_are_refused(rng):
         policy.predict({**observation, "desired_goal": observation["desired_goal"][None]})
 
 
+def test_an_observation_that_is_no_mapping_or_lacks_an_array_is_refused():
+    policy = tandem.load_policy(POLICIES[0])
+    expected = 'expected a mapping with "observation" and "desired_goal"'
+    action = np.zeros(policy.n_action)
+    for call in (policy.predict, lambda observation: policy.q(observation, action)):
+        with pytest.raises(TypeError, match=f"the observation is of type ndarray, {expected}"):
+            call(np.zeros(28))
+        with pytest.raises(KeyError, match=f"the observation has no observation, {expected}"):
+            call({})
+        with pytest.raises(KeyError, match=f"the observation has no desired_goal, {expected}"):
+            call({"observation": np.zeros(policy.n_observation)})
+
+
 def test_files_that_cannot_be_used_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="absent"):
         tandem.load_policy(tmp_path / "absent.safetensors")
