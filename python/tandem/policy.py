@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Mapping
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 _Floats = NDArray[np.float32]
 
+_BEST = "policy/best.safetensors"
+"""The best policy of a run, in its directory."""
+
 
 class Policy:
     """A trained policy: actor, critic and the normalisation of their inputs.
@@ -28,7 +32,7 @@ class Policy:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._native = _native.Policy(path)
+        self._native = _native.Policy(_file_of(path))
 
     @property
     def task(self) -> str:
@@ -183,13 +187,29 @@ class Policy:
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Loads a policy file, such as `policies/student-push.safetensors` or a run's `best.safetensors`.
+    """Loads a policy file, such as `policies/student-push.safetensors`, or the best policy of a run directory.
 
     Raises:
-        OSError: The file cannot be read.
+        OSError: The file does not exist or cannot be read, or the directory has no policy.
         ValueError: The file is no policy, is of another version, or was altered.
     """
     return Policy(path)
+
+
+def _file_of(path: str | os.PathLike[str]) -> str:
+    """Returns the policy file that `path` names: the file itself, or the best policy of a run directory."""
+    file = os.fspath(path)
+    if os.path.isdir(file):
+        file = os.path.join(file, _BEST)
+        if not os.path.exists(file):
+            advice = "name a policy file, or the directory of a run that was evaluated"
+            raise FileNotFoundError(f"{os.fspath(path)} is a directory without {_BEST}: {advice}")
+    if not os.path.exists(file):
+        raise FileNotFoundError(errno.ENOENT, "there is no policy file", file)
+    if file.lower().endswith(".onnx"):
+        command = f"tandem policy import {file} --out FILE.safetensors"
+        raise ValueError(f"{file} is an ONNX model: convert it with `{command}`")
+    return file
 
 
 def _rows(array: ArrayLike) -> _Floats:

@@ -4,6 +4,7 @@ import copy
 import json
 import os
 import pickle
+import shutil
 import subprocess
 
 import gymnasium
@@ -142,14 +143,28 @@ def test_an_observation_that_is_no_mapping_or_lacks_an_array_is_refused():
 
 
 def test_files_that_cannot_be_used_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="absent"):
+    with pytest.raises(FileNotFoundError, match="there is no policy file: '.*absent.safetensors'$"):
         tandem.load_policy(tmp_path / "absent.safetensors")
+    model = tmp_path / "actor.ONNX"
+    model.write_bytes(b"")
+    with pytest.raises(ValueError, match="actor.ONNX is an ONNX model: convert it with `tandem policy import .*actor"):
+        tandem.load_policy(model)
     damaged = tmp_path / "damaged.safetensors"
     content = bytearray(POLICIES[0].read_bytes())
     content[-5] ^= 1
     damaged.write_bytes(content)
     with pytest.raises(ValueError, match="digest"):
         tandem.load_policy(damaged)
+
+
+def test_a_run_directory_gives_its_best_policy(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is a directory without policy/best.safetensors: name a policy file"):
+        tandem.load_policy(tmp_path)
+    best = tmp_path / "policy" / "best.safetensors"
+    best.parent.mkdir()
+    shutil.copy(POLICIES[0], best)
+    assert tandem.load_policy(tmp_path).digest == tandem.load_policy(str(tmp_path)).digest
+    assert tandem.load_policy(tmp_path).digest == tandem.load_policy(POLICIES[0]).digest
 
 
 def test_a_torch_module_gives_the_same_numbers(rng):
