@@ -1,13 +1,16 @@
 """Clients of Tandem's services: `Teacher`, `Learner` and `Bridge`.
 
-Addresses are `HOST:PORT` or URIs. A call waits up to `timeout_s` for a service that is away, and raises `CallError`.
-Every call may be repeated. Messages are those of `proto/proto/tandem/v1`, whose comments describe their fields.
+Addresses are `HOST:PORT` or URIs; a `Learner` also takes a run directory. A call waits up to `timeout_s` for a service
+that is away, and raises `CallError`. Every call may be repeated. Messages are those of
+`proto/proto/tandem/v1`, whose comments describe their fields.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
+import pathlib
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tandem._grpc import Path, ServiceError, grpc, open_channel, uses_tls
+from tandem._grpc import Path, ServiceError, grpc, open_channel, parse_address, uses_tls
 from tandem._proto import (
     bridge_pb2,
     bridge_pb2_grpc,
@@ -280,15 +283,17 @@ def _advice(message: teacher_pb2.StepAdvice) -> Advice:
 
 
 class Learner(_Client):
-    """A client of `tandem learner`.
+    """A client of `tandem learner`, at an address or of the `tandem train` that runs in a directory.
+
+    >>> tandem.Learner("runs/first").status().env_steps
 
     >>> with tandem.Learner("127.0.0.1:7000") as learner:
     ...     for progress in learner.watch():
     ...         print(progress.env_steps, progress.training_success)
     """
 
-    def __init__(self, address: str, **options: Any) -> None:
-        super().__init__(address, **options)
+    def __init__(self, address: Path, **options: Any) -> None:
+        super().__init__(_learner_address(os.fspath(address)), **options)
         self._stub = learner_pb2_grpc.LearnerStub(self._channel)
 
     def status(self) -> learner_pb2.Progress:
@@ -312,6 +317,37 @@ class Learner(_Client):
             finally:
                 stream.cancel()
         raise CallError("UNAVAILABLE", f"{self._address}: the learner is gone before the end of the run")
+
+
+def _learner_address(given: str) -> str:
+    """Returns the address that is given, or that of the learner that runs in the directory that is given."""
+    if not os.path.isdir(given):
+        try:
+            parse_address(given)
+        except ServiceError as error:
+            raise ServiceError(f"{error}, or a run directory") from None
+        return given
+    if not os.path.exists(os.path.join(given, "run.toml")):
+        raise ServiceError(f"{given} holds no run")
+    address = pathlib.Path(given, "in-use", "learner")
+    # A `tandem train` that was killed has left the address, at which another program may listen now.
+    if not address.exists() or not _is_locked(given):
+        raise ServiceError(f"no learner of a `tandem train` is running in {given}")
+    return address.read_text().strip()
+
+
+def _is_locked(directory: str) -> bool:
+    """Returns whether a process has locked a directory, as `tandem train` locks that of its run."""
+    import fcntl  # Windows has none.
+
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
 
 
 @dataclasses.dataclass(frozen=True)

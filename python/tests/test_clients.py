@@ -3,6 +3,7 @@
 import pickle
 import shutil
 import subprocess
+import time
 
 import pytest
 
@@ -10,7 +11,7 @@ pytest.importorskip("grpc")
 
 import numpy as np
 import tandem
-from services import ROOT, service
+from services import ROOT, program, service
 
 POLICY = str(ROOT / "policies/teacher-push-classic.safetensors")
 HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
@@ -48,6 +49,29 @@ def test_nothing_that_answers_is_an_error_within_the_timeout():
         pytest.raises(tandem.CallError, match="no answer within 0.3 s"),
     ):
         next(learner.watch())
+
+
+def test_a_run_directory_leads_to_its_learner(tmp_path):
+    run = tmp_path / "run"
+    with pytest.raises(tandem.ServiceError, match="run' is not an address: expected HOST:PORT, or a run directory"):
+        tandem.Learner(str(run))
+    with pytest.raises(tandem.ServiceError, match="holds no run"):
+        tandem.Learner(tmp_path)
+    command = [program(), "train", "--quiet", "--no-dashboard", "--arms", "1", "--workers", "1", "--out", str(run)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not (run / "in-use" / "learner").exists():
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        with tandem.Learner(run) as learner:
+            assert learner.status().task in ("", "shared-push"), "none until the learner has its settings"
+    finally:
+        process.kill()
+        process.wait()
+    assert (run / "in-use" / "learner").exists(), "a killed run leaves the address"
+    with pytest.raises(tandem.ServiceError, match="no learner of a `tandem train` is running in .*run"):
+        tandem.Learner(run)
 
 
 def unless_busy(error):
