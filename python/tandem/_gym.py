@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import pathlib
 from collections.abc import Callable
 from typing import Any, SupportsFloat, cast
 
@@ -32,6 +33,12 @@ def _make(env_fn: EnvFn) -> gymnasium.Env[Any, Any]:
     if callable(env_fn):
         return env_fn()
     name, kwargs = (env_fn, {}) if isinstance(env_fn, str) else env_fn
+    file, _, env_id = name.partition(":")
+    if file.endswith(".py"):
+        parts = pathlib.PurePath(file).with_suffix("").parts
+        module = ".".join(parts) if all(part.isidentifier() for part in parts) else parts[-1]
+        expected = f"MODULE:ID, such as {module}:{env_id or 'Reach-v0'}, with an id that the module registers"
+        raise ServiceError(f"{name!r} names a file: expected {expected}")
     try:
         try:
             return gymnasium.make(name, **kwargs)

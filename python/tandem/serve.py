@@ -36,7 +36,7 @@ Prints "listening on http://HOST:PORT" once it serves. Exit codes: 0 ended as as
 cannot be used.""",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("env", help="id for gymnasium.make; MODULE:ID imports a module first")
+    parser.add_argument("env", help="id for gymnasium.make; MODULE:ID imports a module first, such as reach.py")
     parser.add_argument(
         "--listen", metavar="HOST:PORT", help=f"address to listen on [{LISTEN_VARIABLE}, or a free port of 127.0.0.1]"
     )

@@ -361,6 +361,14 @@ def test_environments_without_goals_and_unknown_ids_are_refused() -> None:
         tandem.EnvironmentServer("Nowhere-v0")
     with pytest.raises(tandem.ServiceError, match="no environment 'nowhere:Env-v0': No module named 'nowhere'"):
         tandem.EnvironmentServer("nowhere:Env-v0")
+    for name, expected in [
+        ("reach.py", "reach:Reach-v0"),
+        ("arms/reach.py:Arm-v1", "arms.reach:Arm-v1"),
+        ("../reach.py", "reach:Reach-v0"),
+    ]:
+        message = f"{name!r} names a file: expected MODULE:ID, such as {expected}, "
+        with pytest.raises(tandem.ServiceError, match=re.escape(message)):
+            tandem.EnvironmentServer(name)
     with pytest.raises(tandem.ServiceError, match="cannot create environment 'bad!'"):
         tandem.EnvironmentServer("bad!")
     with pytest.raises(tandem.ServiceError, match="cannot create environment .* unexpected keyword argument 'unknown'"):
