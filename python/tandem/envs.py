@@ -19,6 +19,9 @@ Action = NDArray[np.float32]
 EPISODE_STEPS = 50
 """Control steps of an episode."""
 
+DISTANCE_THRESHOLD_M = 0.05
+"""The distance up to which a goal counts as achieved."""
+
 TASKS = {
     "tandem/Push-v0": ("push", 1, "classic"),
     "tandem/PickAndPlace-v0": ("pick-and-place", 1, "classic"),
@@ -84,9 +87,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         height: int = 400,
     ) -> None:
         check_rendering(render_mode, width, height)
+        self._task, self._n_arms, self._world = task_name(task, world), checked_number("n_arms", n_arms), world
         self._simulation = _native.Simulation(
-            task_name(task, world),
-            checked_number("n_arms", n_arms),
+            self._task,
+            self._n_arms,
             substeps=substeps,
             grasped_start_prob=grasped_start_prob,
         )
@@ -96,6 +100,31 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         self.observation_space, self.action_space = spaces_of(self._simulation)
         self._seed: int | None = None
         self._episode = 0
+
+    @property
+    def task(self) -> str:
+        """Name of the task as in policy files, such as `shared-push`; with the same world, the constructor takes it."""
+        return self._task
+
+    @property
+    def n_arms(self) -> int:
+        """Number of arms."""
+        return self._n_arms
+
+    @property
+    def world(self) -> str:
+        """Name of the world: `shared`, `classic` or `slow`."""
+        return self._world
+
+    @property
+    def distance_threshold(self) -> float:
+        """Distance up to which a goal counts as achieved, metres."""
+        return DISTANCE_THRESHOLD_M
+
+    @property
+    def dt(self) -> float:
+        """Simulated time of a control step, seconds."""
+        return 1 / RENDER_FPS[self._world]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -141,9 +170,21 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         """Returns the sparse rewards of goals of shape `[..., n_goal]`, shape `[...]`; `info` has no effect."""
         return compute_reward(achieved_goal, desired_goal)
 
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> bool:
+        """Returns False: an episode never terminates."""
+        return False
+
+    def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> bool:
+        """Returns False: `gymnasium.make` truncates episodes by their number of steps."""
+        return False
+
     def render(self) -> NDArray[np.uint8] | None:
         """Draws the scene, shape `[height, width, 3]`, in render mode `rgb_array`."""
         return None if self.render_mode is None else self._simulation.render(*self._size)
+
+    def __repr__(self) -> str:
+        world = "" if self._world == "shared" else f", world={self._world!r}"
+        return f"TandemEnv({self._task!r}, {self._n_arms}{world})"
 
     def __copy__(self) -> TandemEnv:
         # A shallow copy would share the simulation.

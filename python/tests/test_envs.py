@@ -1,6 +1,7 @@
 """The environments: Gymnasium's rules, the bits of Rust, rewards and seeds."""
 
 import copy
+import json
 import pickle
 import subprocess
 
@@ -11,6 +12,7 @@ from conftest import ENV_IDS
 from gymnasium.utils.env_checker import check_env
 
 import tandem
+from tandem import _native
 from tandem.envs import task_name
 
 
@@ -64,6 +66,33 @@ def test_the_world_is_an_argument():
     assert classic.metadata["render_fps"] == 25 and tandem.TandemEnv().metadata["render_fps"] == 4
     with pytest.raises(ValueError, match="unknown world 'moon': expected classic or shared"):
         tandem.TandemEnv(world="moon")
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_an_environment_describes_itself(env_id):
+    env = gymnasium.make(env_id)
+    spec, own = env.spec.kwargs, env.unwrapped
+    assert (own.task, own.n_arms, own.world) == (task_name(spec["task"], spec["world"]), spec["n_arms"], spec["world"])
+    assert own.distance_threshold == json.loads(_native.task_description(own.task, own.n_arms))["tolerance"]
+    assert own.dt == {"classic": 0.04, "shared": 0.25, "slow": 0.25}[own.world]
+    again = eval(repr(own), {"TandemEnv": tandem.TandemEnv})
+    assert repr(again) == repr(own) and again.observation_space == own.observation_space
+    for name in ("task", "n_arms", "world", "distance_threshold", "dt"):
+        with pytest.raises(AttributeError):
+            setattr(own, name, getattr(own, name))
+    assert repr(tandem.TandemEnv("push", 2)) == "TandemEnv('shared-push', 2)"
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_rewards_and_ends_of_steps_are_those_of_gymnasium_robotics(env_id):
+    env = gymnasium.make(env_id)
+    env.reset(seed=2)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    own = env.unwrapped
+    assert reward == own.compute_reward(*goals, info)
+    assert terminated == own.compute_terminated(*goals, info)
+    assert truncated == own.compute_truncated(*goals, info)
 
 
 def test_unseeded_environments_differ():
