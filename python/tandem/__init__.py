@@ -3,8 +3,21 @@
 Importing the package registers nine environments with Gymnasium: `tandem/Push-v0`, `tandem/PickAndPlace-v0`,
 `tandem/TwoArmPush-v0` and `tandem/TwoArmPickAndPlace-v0`, and the same tasks in the shared world as
 `tandem/SharedPush-v0` and so on; in `tandem/CarryBar-v0` two arms carry a bar. With `pip install 'tandem-rl[fetch]'`
-there are two more, in MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`. Servers, clients
-and `ServedEnv` need gRPC: `pip install 'tandem-rl[grpc]'`.
+there are two more, in MuJoCo: `tandem/TwoFetchPush-v0` and `tandem/TwoFetchPickAndPlace-v0`.
+
+Servers and clients need gRPC (`pip install 'tandem-rl[grpc]'`); `help(tandem.serve)` describes one of them:
+
+    serve, EnvironmentServer    serve a Gymnasium environment, in which workers play
+    serve_policy, PolicyServer  serve a policy, which a teacher consults
+    ServedEnv                   an environment with the vectors that its server gives workers
+    episode_seed                the seed of an episode on such a server
+    Task, Arm                   the description of a task, and of one arm's part of its vectors
+    Manipulation                what arms share and success needs, with ArmManipulation and Condition
+    Reflection                  a mirror symmetry of a task; FETCH_REFLECTION is that of Fetch
+    Teacher                     asks a teacher for advice on a Step
+    Learner                     follows the progress of a run
+    Bridge                      moves a pair of arms from WayPoint to WayPoint
+    ServiceError                a server or a call that failed; CallError and MotionStopped are kinds of it
 """
 
 from typing import TYPE_CHECKING, Any
@@ -36,6 +49,8 @@ if TYPE_CHECKING:
     from tandem.clients import Teacher as Teacher
     from tandem.clients import WayPoint as WayPoint
 
+    __version__: str
+
 __all__ = ["Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_policy"]
 
 register_envs()
@@ -55,9 +70,18 @@ _SERVICES = {
 def __getattr__(name: str) -> Any:
     import importlib
 
+    if name == "__version__":
+        import importlib.metadata
+
+        return importlib.metadata.version("tandem-rl")
     for module, names in _SERVICES.items():
         if name in names:
             value = getattr(importlib.import_module(f"tandem.{module}"), name)
             globals()[name] = value
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    lazy = (name for names in _SERVICES.values() for name in names)
+    return sorted({*globals(), "__version__", *lazy} - {"Any", "TYPE_CHECKING"})
