@@ -322,13 +322,15 @@ def _checked_norm(
 def _sparse_reward(
     compute_reward: Any, achieved: NDArray[Any], desired: NDArray[Any], info: dict[str, Any]
 ) -> float:
-    reward = float(compute_reward(achieved, desired, info))
-    if reward not in (-1.0, 0.0):
+    """Returns the reward as -1 or 0, also of an environment whose rewards are 0 and 1."""
+    reward, at_goal = (float(compute_reward(achieved, goal, info)) for goal in (desired, achieved.copy()))
+    sparse = reward - 1.0 if at_goal == 1.0 else reward
+    if sparse not in (-1.0, 0.0):
         raise ServiceError(
-            f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0 "
+            f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0, or 0 or 1 "
             "(many environments take reward_type=\"sparse\")"
         )
-    return reward
+    return sparse
 
 
 def _goal_pairs(

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -479,18 +479,29 @@ def test_a_tolerance_that_the_environment_does_not_name_is_measured() -> None:
     assert (task.tolerance, task.norm, task.name) == (0.175, "euclidean", "pointenv")
 
 
-@pytest.mark.parametrize(
-    ("reward", "returned"),
-    [(lambda apart: -apart, r"-\d\.\d+"), (lambda apart: float(apart <= 0.25), "1")],
-    ids=["a dense reward of a sample, not of the first distance tried", "1 or 0"],
-)
-def test_another_reward_is_refused_before_its_tolerance_is_measured(reward: Any, returned: str) -> None:
+def with_reward(reward: Callable[[float], float]) -> PointEnv:
     env = PointEnv()
     del env.distance_threshold
-    env.compute_reward = lambda a, b, info: reward(np.linalg.norm(a - b))  # type: ignore[method-assign]
-    expected = f"the reward is not sparse: compute_reward returned {returned}, expected -1 or 0"
+    env.compute_reward = lambda a, b, info: reward(float(np.linalg.norm(a - b)))  # type: ignore[method-assign]
+    return env
+
+
+@pytest.mark.parametrize(
+    ("reward", "returned"),
+    [(lambda apart: -apart, r"-\d\.\d+"), (lambda apart: np.exp(-apart), r"0\.\d+")],
+    ids=["a dense reward of a sample, not of the first distance tried", "one that is 1 at the goal"],
+)
+def test_another_reward_is_refused_before_its_tolerance_is_measured(reward: Any, returned: str) -> None:
+    expected = f"the reward is not sparse: compute_reward returned {returned}, expected -1 or 0, or 0 or 1"
     with pytest.raises(tandem.ServiceError, match=expected):
-        describe(env, TaskOptions(episode_steps=5))
+        describe(with_reward(reward), TaskOptions(episode_steps=5))
+
+
+def test_rewards_of_1_within_the_tolerance_and_0_beyond_it_are_sparse_too() -> None:
+    env = with_reward(lambda apart: float(apart <= 0.25))
+    assert describe(env, TaskOptions(episode_steps=5))[0].tolerance == 0.25
+    with pytest.raises(tandem.ServiceError, match=r"at euclidean distance 0\.\d+, expected"):
+        describe(env, TaskOptions(episode_steps=5, tolerance=0.3))
 
 
 def test_the_packages_own_environments_can_be_served() -> None:
