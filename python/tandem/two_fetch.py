@@ -12,14 +12,18 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
-import gymnasium_robotics
-import mujoco
 import numpy as np
 from gymnasium import spaces
-from gymnasium_robotics.utils import mujoco_utils, rotations
 from numpy.typing import ArrayLike, NDArray
 
 from tandem.envs import check_rendering, compute_reward
+
+try:
+    import gymnasium_robotics
+    import mujoco
+    from gymnasium_robotics.utils import mujoco_utils, rotations
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(f"{error}: pip install 'tandem-rl[fetch]'", name=error.name) from None
 
 Floats = NDArray[np.float64]
 Observation = dict[str, Floats]

@@ -14,6 +14,8 @@ ENV_IDS = [
     "tandem/TwoArmPush-v0",
     "tandem/TwoArmPickAndPlace-v0",
     "tandem/SharedPush-v0",
+    "tandem/SharedPickAndPlace-v0",
+    "tandem/SharedTwoArmPush-v0",
     "tandem/SharedTwoArmPickAndPlace-v0",
     "tandem/CarryBar-v0",
 ]
