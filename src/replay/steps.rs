@@ -29,11 +29,8 @@ pub(super) fn print(file: &Path) -> Result<(), Failed> {
         let cells = cells(task, &step.observation, &step.goal, step.advised_arms);
         output::print(line(&format!("{step_idx:>4}"), &cells, contacts_text(step.contacts)))?;
     }
-    let last = log.last_observation.as_ref().zip(log.transitions.last());
-    last.map_or(Ok(()), |(observation, LoggedTransition { goal, .. })| {
-        let observations = log.transitions.iter().map(|step| &step.observation);
-        let counted = observations.chain([observation]).rev().take(task.success_steps());
-        let is_success = counted.into_iter().all(|observation| task.is_success(observation, goal));
+    let last = log.last_observation.as_ref().zip(log.transitions.last()).zip(log.succeeded());
+    last.map_or(Ok(()), |((observation, LoggedTransition { goal, .. }), is_success)| {
         output::print(line(" end", &cells(task, observation, goal, 0), ""))?;
         output::print(if is_success { "success" } else { "failure" })
     })

@@ -6,7 +6,7 @@ use std::path::Path;
 use mcap::McapError;
 use mcap::read::ChannelAccumulator;
 use mcap::records::Record;
-use tandem_core::{ArmAdvice, Contacts, TaskSpec};
+use tandem_core::{ArmAdvice, ArmIndex, Contacts, TaskSpec};
 
 use crate::error::Error;
 use crate::messages::{EpisodeMetadata, METADATA_NAME, decode, pb};
@@ -47,6 +47,33 @@ pub struct LoggedTransition {
     /// Units of the advice budget left when the teacher answered; `None` if it was not asked or the log is of an earlier
     /// version.
     pub budget_left: Option<u64>,
+}
+
+impl EpisodeLog {
+    /// Returns whether every arm succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if
+    /// the log is incomplete.
+    #[must_use]
+    pub fn succeeded(&self) -> Option<bool> {
+        let task = &self.metadata.layout;
+        self.ends_with(|observation, goal| task.is_success(observation, goal))
+    }
+
+    /// Returns whether `arm` succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if the
+    /// log is incomplete.
+    #[must_use]
+    pub fn arm_succeeded(&self, arm: ArmIndex) -> Option<bool> {
+        let task = &self.metadata.layout;
+        self.ends_with(|observation, goal| task.arm_succeeds(arm, observation, goal))
+    }
+
+    fn ends_with(&self, succeeds: impl Fn(&[f32], &[f32]) -> bool) -> Option<bool> {
+        let (last, goal) = (self.last_observation.as_ref()?, &self.transitions.last()?.goal);
+        let n_counted = self.metadata.layout.success_steps();
+        let observations = self.transitions.iter().map(|step| &step.observation).chain([last]);
+        let counted: Vec<_> = observations.rev().take(n_counted).collect();
+        let is_long_enough = counted.len() == n_counted;
+        Some(is_long_enough && counted.into_iter().all(|observation| succeeds(observation, goal)))
+    }
 }
 
 /// Reads the episode in the MCAP log `path`.

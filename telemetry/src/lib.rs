@@ -11,6 +11,7 @@ mod arms_view;
 pub mod episode_log;
 mod error;
 pub mod events;
+#[cfg(feature = "live")]
 pub mod live;
 mod log_budget;
 mod log_file;

@@ -142,10 +142,14 @@ fn outcome(n_at_goal: [usize; 2]) -> (bool, Vec<bool>) {
         recorder.record_step(None, &synthetic::record(step, &transition)).unwrap();
     }
     recorder.record_outcome(None, &observation(n_steps)).unwrap();
-    let bytes = std::fs::read(recorder.finish().unwrap()).unwrap();
+    let path = recorder.finish().unwrap();
+    let bytes = std::fs::read(&path).unwrap();
     let mut messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
     let message = messages.find(|message| message.channel.topic == "/outcome").unwrap();
     let outcome = <ShownOutcome as prost::Message>::decode(&*message.data).unwrap();
+    let log = read_episode(&path).unwrap();
+    let per_arm: Vec<bool> = task.arms().filter_map(|arm| log.arm_succeeded(arm)).collect();
+    assert_eq!((log.succeeded(), &per_arm), (Some(outcome.success), &outcome.success_per_arm));
     (outcome.success, outcome.success_per_arm)
 }
 
