@@ -28,7 +28,7 @@ const ALLOWED: [(&str, &[&str]); 20] = [
 ];
 
 /// The Python package, which has a workspace of its own and is in no image.
-const PYTHON: (&str, &[&str]) = ("python", &["core", "picture", "sim", "policy"]);
+const PYTHON: (&str, &[&str]) = ("python", &["core", "picture", "sim", "policy", "telemetry"]);
 /// The browser demo, which has a workspace of its own as well.
 const DEMO: (&str, &[&str]) = ("demo", &["core", "picture", "sim", "policy"]);
 

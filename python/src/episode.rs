@@ -1,7 +1,7 @@
 //! An environment together with its current observation.
 
 use pyo3::PyErr;
-use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use tandem_core::reward::{achieved_goal, sparse_reward};
 use tandem_core::{Contacts, Layout, Stream, Task, TaskSpec, WorldSettings, episode_rng};
 use tandem_sim::{Env, SimError, WorldConfig};
@@ -126,4 +126,12 @@ pub(crate) fn step_error(error: &SimError) -> PyErr {
 
 pub(crate) fn value_error(error: impl std::fmt::Display) -> PyErr {
     PyValueError::new_err(error.to_string())
+}
+
+/// Returns the `OSError` of a file that cannot be read, such as a `FileNotFoundError`.
+pub(crate) fn file_error(source: &std::io::Error, text: String) -> PyErr {
+    match source.raw_os_error() {
+        Some(code) => PyOSError::new_err((code, text)),
+        None => PyOSError::new_err(text),
+    }
 }

@@ -5,12 +5,11 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use numpy::{PyArray1, PyArray2, PyArrayDyn, PyArrayMethods as _, PyReadonlyArray2};
-use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 use tandem_policy::{Actor, Critic, Error};
 
-use crate::episode::value_error;
+use crate::episode::{file_error, value_error};
 
 /// A policy and its networks. `tandem.Policy` gives it an interface for arrays of any shape.
 #[pyclass(module = "tandem._native", frozen)]
@@ -186,10 +185,7 @@ fn checked(
 fn load_error(error: Error) -> PyErr {
     let text = tandem_core::text::error_chain(&error);
     match error {
-        Error::Read { source, .. } => match source.raw_os_error() {
-            Some(code) => PyOSError::new_err((code, text)),
-            None => PyOSError::new_err(text),
-        },
-        _ => PyValueError::new_err(text),
+        Error::Read { source, .. } => file_error(&source, text),
+        _ => value_error(text),
     }
 }

@@ -23,6 +23,7 @@ Servers and clients need gRPC (`pip install 'tandem-rl[grpc]'`); `help(tandem.se
 from typing import TYPE_CHECKING, Any
 
 from tandem.envs import TandemEnv, compute_reward, register_envs
+from tandem.episodes import Episode, read_episodes
 from tandem.policy import Policy, load_policy
 from tandem.vector import TandemVectorEnv
 
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_policy"]
+__all__ = ["Episode", "Policy", "TandemEnv", "TandemVectorEnv", "compute_reward", "load_policy", "read_episodes"]
 
 register_envs()
 

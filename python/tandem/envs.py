@@ -210,6 +210,14 @@ def task_name(task: str, world: str) -> str:
     return f"{world}-{task}" if world == "shared" else task
 
 
+def env_id_of(task: str, n_arms: int) -> str | None:
+    """Returns the name of the environment with the task that files name `task`; None if the simulator has none."""
+    for env_id, (name, number, world) in TASKS.items():
+        if (task_name(name, world), number) == (task, n_arms):
+            return env_id
+    return None
+
+
 def compute_reward(achieved_goal: ArrayLike, desired_goal: ArrayLike) -> float | NDArray[np.float32]:
     """Returns the sparse reward of goals: 0 within 5 cm, -1 beyond.
 

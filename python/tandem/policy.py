@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tandem import _native
-from tandem.envs import TASKS
+from tandem.envs import env_id_of
 
 if TYPE_CHECKING:
     from tandem.torch_policy import TorchPolicy
@@ -66,7 +66,7 @@ class Policy:
         Raises:
             ValueError: The task is not of this package's simulator.
         """
-        env_id = self._built_in_env_id()
+        env_id = env_id_of(self.task, self.n_arms)
         if env_id is None:
             own = "create its environment by its own id and wrap it in tandem.ServedEnv"
             raise ValueError(f"task {self.task!r} is not of this package's simulator: {own}")
@@ -157,16 +157,10 @@ class Policy:
         is_batch = np.ndim(observation["observation"]) > 1
         observations = _rows(observation["observation"])
         expected = (len(observations), self._native.n_observation)
-        if observations.shape != expected and self._built_in_env_id() is None:
+        if observations.shape != expected and env_id_of(self.task, self.n_arms) is None:
             served = f"tandem.ServedEnv gives an environment the vectors that {self.task!r} had on its server"
             raise ValueError(f"observations have shape {observations.shape}, expected {expected}: {served}")
         return observations, _rows(observation["desired_goal"]), is_batch
-
-    def _built_in_env_id(self) -> str | None:
-        for env_id, (task, n_arms, world) in TASKS.items():
-            if (f"shared-{task}" if world == "shared" else task, n_arms) == (self.task, self.n_arms):
-                return env_id
-        return None
 
     @property
     def _description(self) -> str | None:
