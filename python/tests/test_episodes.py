@@ -1,5 +1,6 @@
 """Episodes from logs: every number is that of the environment that played them; damaged and foreign logs."""
 
+import contextlib
 import copy
 import json
 import pickle
@@ -12,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import POLICIES, ROOT
-from services import program
+from services import program, service
 
 import tandem
 
@@ -214,6 +215,21 @@ def test_logs_of_trials_are_left_out_of_a_directory_and_refused_by_name(logs):
     (logs / "b.mcap").unlink()
     with pytest.raises(ValueError, match="no log of an episode among 1 log of trials or motions, the first"):
         next(tandem.read_episodes(logs))
+
+
+def test_the_log_of_a_motion_is_refused(tmp_path):
+    pytest.importorskip("grpc")
+    from test_clients import HOME
+
+    with service("bridge", "--driver", "sim", "--record", str(tmp_path)) as address:
+        with tandem.Bridge(address) as bridge, bridge.lease() as lease, contextlib.suppress(tandem.ServiceError):
+            lease.reset()
+            lease.move([HOME], speed=1.0)
+    logs = list(tmp_path.glob("*.mcap"))
+    if not logs:
+        pytest.skip("the machine is too busy to move arms")
+    with pytest.raises(ValueError, match="is the log of a bridge's motion, not of an episode"):
+        next(tandem.read_episodes(logs[0]))
 
 
 def test_paths_without_logs_are_refused_at_once(tmp_path):
