@@ -150,6 +150,12 @@ fn a_student_of_two_arms_is_advised_by_a_teacher_of_one_and_tested() {
     assert!(spent > 0, "{student}");
     assert_eq!(spent + student["budget_left"].as_u64().expect("a count"), 300);
     assert!(student["environment"].as_str().expect("checked").starts_with("deterministic"));
+    let shown = json(&run(&["policy", "show", text(&TRAINED.student_path()), "--json"]));
+    assert_eq!(shown["description"]["tolerance"], 0.25, "{shown}");
+    let shown = run(&["policy", "show", text(&TRAINED.student_path())]);
+    let shown = String::from_utf8_lossy(&shown.stdout).into_owned();
+    let line = shown.lines().find(|line| line.starts_with("description "));
+    assert!(line.is_some_and(|line| line.contains("\"tolerance\":0.25")), "{shown}");
 }
 
 #[test]

@@ -157,10 +157,16 @@ fn read_policy(
     expect_entry(&metadata, "format", FORMAT)?;
     let layout = match entry(&metadata, "format_version")? {
         DESCRIBED_FORMAT_VERSION => parse_description(&metadata)?,
-        _ => {
-            expect_entry(&metadata, "format_version", FORMAT_VERSION)?;
+        FORMAT_VERSION => {
             let task = parse_task(&metadata)?;
             Layout::new(task, parse_size(&metadata, "n_arms", MAX_ARMS)?).into()
+        }
+        got => {
+            return Err(FormatError::Metadata {
+                key: "format_version",
+                got: shortened(got, MAX_SHOWN_CHARS),
+                expected: format!("{FORMAT_VERSION:?} or {DESCRIBED_FORMAT_VERSION:?}"),
+            });
         }
     };
     let n_hidden = parse_size(&metadata, "n_hidden", MAX_HIDDEN)?;

@@ -20,12 +20,18 @@ pub(super) fn show(args: &ShowArgs) -> Result<(), Failed> {
 
 fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
+    let described = policy.layout.as_built_in().is_none();
+    let description = described.then(|| json!(policy.layout.description()));
     if args.json {
-        return output::print(json!({
+        let mut shown = json!({
             "task": policy.layout.name(), "arms": policy.layout.n_arms(), "n_hidden": policy.n_hidden,
             "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
             "metadata": policy.metadata,
-        }));
+        });
+        if let Some(description) = description {
+            shown["description"] = description;
+        }
+        return output::print(shown);
     }
     line("task", policy.layout.name())?;
     line("arms", policy.layout.n_arms())?;
@@ -38,7 +44,8 @@ fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
     let (n_actor, n_critic) = (policy.actor.len(), policy.critic.len());
     line("parameters", format_args!("actor {n_actor}, critic {n_critic}"))?;
     line("digest", policy.digest())?;
-    show_metadata(&policy.metadata)
+    let description = description.map(|text| ("description".to_owned(), text.to_string()));
+    show_metadata(&policy.metadata.into_iter().chain(description).collect())
 }
 
 fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
