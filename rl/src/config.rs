@@ -24,6 +24,9 @@ mod tests;
 pub use checks::is_name;
 pub use recipe::Recipe;
 
+/// The most episodes of an evaluation's slot.
+pub(crate) const EVALUATION_SLOT_EPISODES: usize = 8;
+
 /// The resolved settings of a run.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -316,6 +319,13 @@ impl RunConfig {
     #[must_use]
     pub const fn episodes_per_round(&self) -> u64 {
         (self.rounds.slots * self.rounds.rollouts) as u64
+    }
+
+    /// Returns the number of episodes of the run's largest slot, in training or in an evaluation.
+    #[must_use]
+    pub fn largest_slot(&self) -> usize {
+        let n_evaluated = usize::try_from(self.evaluation.episodes).unwrap_or(usize::MAX);
+        self.rounds.rollouts.max(n_evaluated.min(EVALUATION_SLOT_EPISODES))
     }
 
     /// Returns the units of advice of the whole run.

@@ -21,8 +21,11 @@ pub enum Recipe {
     Tandem,
 }
 
-/// Environment steps of the paper's epoch: 50 rounds of 32 episodes of 50 steps (decision 005).
-const PAPER_EPOCH_ENV_STEPS: u64 = 80_000;
+/// Rounds of the paper's epoch (decision 005).
+const PAPER_EPOCH_ROUNDS: u64 = 50;
+/// Slots of the paper's round, and episodes of a slot.
+const PAPER_SLOTS: usize = 16;
+const PAPER_ROLLOUTS: usize = 2;
 
 /// Width of the hidden layers, in both recipes; recipe `tandem` halves it for two arms in the world `shared`.
 const N_HIDDEN: usize = 256;
@@ -88,7 +91,7 @@ impl RunConfig {
             ddpg: ddpg(recipe, layout),
             evaluation: EvaluationConfig {
                 // The paper evaluates once per epoch.
-                every_env_steps: if tandem { 20_000 } else { PAPER_EPOCH_ENV_STEPS },
+                every_env_steps: if tandem { 20_000 } else { paper_epoch_env_steps(layout) },
                 early_points: 4,
                 episodes: 240,
                 seed: 240_240,
@@ -129,14 +132,14 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
             per_epoch: 50,
         },
         Recipe::Paper => RoundsConfig {
-            slots: 16,
-            rollouts: 2,
+            slots: PAPER_SLOTS,
+            rollouts: PAPER_ROLLOUTS,
             lag: 0,
             updates_per_env_step: 0.025,
             polyak_every: PolyakEvery::Round,
             warmup_env_steps: 0,
             final_greedy_share: 0.0,
-            per_epoch: 50,
+            per_epoch: PAPER_EPOCH_ROUNDS,
         },
     }
 }
@@ -157,12 +160,18 @@ fn grasps(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.grasps())
 }
 
+/// Returns the environment steps of the paper's epoch: 80,000 in the built-in tasks, whose episodes have 50 steps.
+fn paper_epoch_env_steps(layout: &TaskSpec) -> u64 {
+    let n_episodes = (PAPER_SLOTS * PAPER_ROLLOUTS) as u64;
+    PAPER_EPOCH_ROUNDS * n_episodes * layout.episode_steps() as u64
+}
+
 /// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
 /// after 43 and 898.
 fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
     let max_env_steps = match (recipe, layout.as_built_in()) {
-        (Recipe::Paper, _) if layout.n_arms() == 1 => 50 * PAPER_EPOCH_ENV_STEPS,
-        (Recipe::Paper, _) => 900 * PAPER_EPOCH_ENV_STEPS,
+        (Recipe::Paper, _) if layout.n_arms() == 1 => 50 * paper_epoch_env_steps(layout),
+        (Recipe::Paper, _) => 900 * paper_epoch_env_steps(layout),
         (Recipe::Tandem, Some(built_in)) if is_shared(layout) => {
             match (built_in.n_arms, built_in.task.grasps()) {
                 (1, false) => 100_000,

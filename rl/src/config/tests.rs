@@ -23,7 +23,36 @@ fn the_papers_round_has_forty_updates() {
     assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
     let epoch = paper.rounds.per_epoch * paper.env_steps_per_round();
     assert_eq!((paper.evaluation.every_env_steps, paper.stop.max_env_steps), (epoch, 900 * epoch));
+    assert_eq!(epoch, 80_000);
     assert_eq!(paper.advice_budget(), 8_000_000, "16 slots of 500,000");
+}
+
+#[test]
+fn the_papers_epochs_follow_the_length_of_the_tasks_episodes() {
+    for (n_arms, n_epochs) in [(1, 50), (2, 900)] {
+        let push = TaskSpec::built_in(Task::Push, n_arms);
+        let mut description = push.description().clone();
+        (description.name, description.episode_steps) = ("lab/short".to_owned(), 20);
+        let short = TaskSpec::new(description).expect("valid");
+        for (task, epoch) in [(push, 80_000), (short, 32_000)] {
+            let paper = RunConfig::defaults_of(Recipe::Paper, &task);
+            assert_eq!(paper.env_steps_per_round() * paper.rounds.per_epoch, epoch);
+            let (every, max) = (paper.evaluation.every_env_steps, paper.stop.max_env_steps);
+            assert_eq!((every, max), (epoch, n_epochs * epoch), "{}", task.name());
+        }
+    }
+}
+
+#[test]
+fn the_largest_slot_is_one_of_training_or_of_an_evaluation() {
+    let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
+    let mut check = |rollouts, episodes, expected| {
+        (config.rounds.rollouts, config.evaluation.episodes) = (rollouts, episodes);
+        assert_eq!(config.largest_slot(), expected);
+    };
+    check(2, 240, 8);
+    check(2, 4, 4);
+    check(16, 240, 16);
 }
 
 #[test]

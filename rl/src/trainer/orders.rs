@@ -4,9 +4,7 @@ use tandem_core::episode::EpisodeKind;
 use tandem_core::work::{EpisodeExploration, EpisodeOrder, SlotOrder};
 
 use super::Trainer;
-
-/// Episodes of an evaluation slot.
-const EVALUATION_SLOT_EPISODES: usize = 8;
+use crate::config::EVALUATION_SLOT_EPISODES;
 
 impl Trainer {
     /// Returns the training slots of round `round`, for parameter version `version`.
