@@ -183,6 +183,16 @@ fn what_cannot_be_converted_is_refused_in_one_line() {
         64,
         "strategy mc-q:0.1 compares values of actions, and the teacher's policy has no critic",
     );
+    refused(
+        &["train", "--teacher", FOREIGN, "--out", &files.name("run")],
+        64,
+        "is a teacher for push, the run is for shared-push: its file names no task and was taken for the one that its \
+         vectors fit, so add the metadata \"task\" and \"n_arms\", or convert it with `tandem policy import`",
+    );
+    let pick = ["train", "--task", "pick-and-place", "--teacher", &actor, "--out"];
+    let refusal = tandem(&[&pick[..], &[&files.name("run")]].concat());
+    let line = String::from_utf8_lossy(&refusal.stderr).into_owned();
+    assert!(line.trim_end().ends_with("the run is for shared-pick-and-place"), "{line}");
     assert!(!files.path("run").exists(), "a refused run leaves no directory");
 }
 

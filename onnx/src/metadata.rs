@@ -91,7 +91,10 @@ fn described(parts: &[Part], arm: ArmIndex, range: Range<usize>) -> Vec<Value> {
 
 fn value_text(n_heads: usize) -> String {
     let of = if n_heads == 1 { "of the joint reward" } else { "of each arm's reward" };
-    format!("expected discounted sum {of}, -1 for each step without success")
+    format!(
+        "expected discounted sum {of} in training: -1 for each step that misses the goal by more than the tolerance of \
+         training, otherwise 0, less the costs that training charges, such as those of contacts"
+    )
 }
 
 /// Returns the success rate of the evaluation that chose the policy, with its 95 % interval (Wilson), if the policy's

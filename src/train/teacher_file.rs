@@ -36,7 +36,10 @@ pub(crate) struct TeacherFile {
 /// The kind of a teacher.
 enum Source {
     Policy(Policy),
-    Models,
+    /// ONNX models; whether the actor's metadata names the task.
+    Models {
+        names_task: bool,
+    },
     Server(PolicyServer),
 }
 
@@ -64,7 +67,8 @@ impl TeacherFile {
             let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
             let (digest, layout) = (models.digest().to_owned(), models.layout());
             let has_values = models.has_values();
-            return Ok(Self { path, critic, digest, layout, has_values, source: Source::Models });
+            let source = Source::Models { names_task: models.names_task() };
+            return Ok(Self { path, critic, digest, layout, has_values, source });
         }
         if critic.is_some() {
             return Err(teacher_failed(Error::SurplusCritic));
@@ -143,7 +147,7 @@ impl TeacherFile {
     pub(super) const fn server(&self) -> Option<&PolicyServer> {
         match &self.source {
             Source::Server(server) => Some(server),
-            Source::Policy(_) | Source::Models => None,
+            Source::Policy(_) | Source::Models { .. } => None,
         }
     }
 
@@ -164,9 +168,10 @@ impl TeacherFile {
                 false => format!(", which needs one for {wanted}"),
             };
             return Err(Failed::usage(format!(
-                "{shown} is a teacher for {}, the run is for {}{needed}",
+                "{shown} is a teacher for {}, the run is for {}{needed}{}",
                 self.layout.name(),
-                config.task
+                config.task,
+                self.advice_on_task()
             )));
         }
         if let Some(difference) = one_arm.and_then(|task| task.difference(&self.layout)) {
@@ -189,6 +194,17 @@ impl TeacherFile {
                     .context(shown.to_string()))
             }
             _ => Ok(()),
+        }
+    }
+
+    /// Returns what to do about a model that names no task, to be appended to a refusal.
+    const fn advice_on_task(&self) -> &'static str {
+        match self.source {
+            Source::Models { names_task: false } => {
+                ": its file names no task and was taken for the one that its vectors fit, so add the metadata \"task\" \
+                 and \"n_arms\", or convert it with `tandem policy import`, which takes the task"
+            }
+            _ => "",
         }
     }
 
@@ -220,7 +236,7 @@ impl TeacherFile {
     pub(super) fn copy_path(&self, directory: &Path) -> PathBuf {
         directory.join(match self.source {
             Source::Policy(_) => POLICY_COPY,
-            Source::Models => ACTOR_COPY,
+            Source::Models { .. } => ACTOR_COPY,
             Source::Server(_) => SERVER_COPY,
         })
     }
@@ -263,7 +279,7 @@ impl TeacherFile {
                 let saved = policy.save(&self.copy_path(directory));
                 saved.or_exit(Exit::TryAgain, String::new)
             }
-            Source::Models | Source::Server(_) => self.copy_to(directory),
+            Source::Models { .. } | Source::Server(_) => self.copy_to(directory),
         }
     }
 }

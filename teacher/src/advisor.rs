@@ -74,7 +74,8 @@ impl Advisor {
         let policy = policy.into();
         let layout = policy.layout();
         if layout.n_arms() != 1 {
-            return Err(Error::NotOneArm { n_arms: layout.n_arms(), n_values: 1 });
+            let (policy, n_arms) = ("this one".to_owned(), layout.n_arms());
+            return Err(Error::NotOneArm { policy, n_arms });
         }
         let info = TeacherInfo {
             digest: policy.digest().to_owned(),

@@ -1,5 +1,6 @@
 //! The errors of a teacher.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use tandem_proto::DecodeError;
@@ -14,15 +15,31 @@ pub enum Error {
     /// The policy cannot be loaded.
     #[error("cannot use the teacher's policy")]
     Policy(#[from] tandem_policy::Error),
-    /// The policy is not for one arm with one value.
-    #[error(
-        "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives {n_arms} and returns {n_values}"
-    )]
+    /// The policy is not for one arm.
+    #[error("a teacher needs a policy that drives 1 arm, {policy} drives {n_arms}")]
     NotOneArm {
+        /// The policy's file, or "this one".
+        policy: String,
         /// The number of arms of the policy.
         n_arms: usize,
+    },
+    /// The policy's critic has several values.
+    #[error("a teacher needs a critic that returns 1 value, that of {policy} returns {n_values}")]
+    NotOneValue {
+        /// The policy's file, or "this one".
+        policy: String,
         /// The number of values of its critic.
         n_values: usize,
+    },
+    /// An actor is given in place of its critic.
+    #[error(
+        "{path:?} is not a critic but an actor: it takes no action and returns {n_outputs} numbers"
+    )]
+    NotACritic {
+        /// The file.
+        path: PathBuf,
+        /// The number of its outputs.
+        n_outputs: usize,
     },
     /// An ONNX model cannot be used as the teacher's policy.
     #[error("cannot use the teacher's policy")]

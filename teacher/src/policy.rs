@@ -155,7 +155,7 @@ impl OneArmPolicy {
     /// # Errors
     /// When the file is not a valid policy, or [`Self::new`] refuses the policy.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        Self::new(&Policy::load(path)?)
+        Self::of(&Policy::load(path)?, format!("{path:?}"))
     }
 
     /// Prepares `policy` for inference.
@@ -163,11 +163,17 @@ impl OneArmPolicy {
     /// # Errors
     /// When the policy is not for one arm, or its critic has several values.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
-        if policy.layout.n_arms() != 1 || policy.n_heads != 1 {
-            return Err(Error::NotOneArm {
-                n_arms: policy.layout.n_arms(),
-                n_values: policy.n_heads,
-            });
+        Self::of(policy, "this one".to_owned())
+    }
+
+    /// Prepares a policy that errors call `name`.
+    fn of(policy: &Policy, name: String) -> Result<Self, Error> {
+        let (n_arms, n_values) = (policy.layout.n_arms(), policy.n_heads);
+        if n_arms != 1 {
+            return Err(Error::NotOneArm { policy: name, n_arms });
+        }
+        if n_values != 1 {
+            return Err(Error::NotOneValue { policy: name, n_values });
         }
         Ok(Self {
             digest: policy.digest(),
@@ -253,11 +259,13 @@ mod tests {
 
     #[test]
     fn only_a_policy_for_one_arm_can_teach() {
-        let refusal = OneArmPolicy::new(&policy(2, 1, 0.5)).err().unwrap().to_string();
+        let refusal = |n_arms, n_heads| {
+            OneArmPolicy::new(&policy(n_arms, n_heads, 0.5)).err().unwrap().to_string()
+        };
+        assert_eq!(refusal(2, 1), "a teacher needs a policy that drives 1 arm, this one drives 2");
         assert_eq!(
-            refusal,
-            "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives 2 and returns 1"
+            refusal(1, 2),
+            "a teacher needs a critic that returns 1 value, that of this one returns 2"
         );
-        assert!(OneArmPolicy::new(&policy(1, 2, 0.5)).is_err());
     }
 }

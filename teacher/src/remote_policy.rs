@@ -249,7 +249,7 @@ impl Connection {
     }
 
     fn failed(&self, status: &Status) -> RemoteError {
-        let (address, reason) = (self.address.clone(), status.message().to_owned());
+        let (address, reason) = (self.address.clone(), self.reason(status));
         match status.code() {
             Code::FailedPrecondition => RemoteError::Changed { address, reason },
             Code::Internal => RemoteError::Failed { address, reason },
@@ -258,6 +258,14 @@ impl Connection {
             }
             _ => RemoteError::Refused { address, reason },
         }
+    }
+
+    /// Returns the message of a failure without the part that [`RemoteError::Unavailable`] repeats.
+    fn reason(&self, status: &Status) -> String {
+        let message = status.message();
+        let of_address = message.strip_prefix(&self.address);
+        let reason = of_address.and_then(|rest| rest.strip_prefix(" does not answer: "));
+        reason.unwrap_or(message).to_owned()
     }
 
     fn invalid(&self, error: &DecodeError) -> RemoteError {

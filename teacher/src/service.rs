@@ -259,6 +259,8 @@ fn status(error: &Error) -> Status {
         | Error::SurplusCritic
         | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
+        | Error::NotOneValue { .. }
+        | Error::NotACritic { .. }
         | Error::NotFinite { .. }
         | Error::RemotePolicy(_)
         | Error::Panicked

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use tandem_core::TaskSpec;
-use tandem_onnx::binding::{check_pair, layout_of};
+use tandem_onnx::binding::{Source, check_pair, layout_of, names_task};
 use tandem_onnx::{BoundNetwork, Error as OnnxError, Model, ModelError, Role};
 
 use super::TeacherPolicy;
@@ -15,6 +15,7 @@ use crate::error::Error;
 /// digests.
 pub struct OnnxPolicy {
     digest: String,
+    names_task: bool,
     actor: BoundNetwork,
     critic: Option<BoundNetwork>,
 }
@@ -32,32 +33,45 @@ impl OnnxPolicy {
         let layout = layout_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;
         let bound = BoundNetwork::new(&model, Role::Actor, &layout);
         let bound = bound.map_err(|source| refused(actor, source))?;
+        let n_arms = bound.layout().n_arms();
+        if n_arms != 1 {
+            return Err(Error::NotOneArm { policy: shown(actor), n_arms });
+        }
+        let names_task = names_task(&model);
         let Some(path) = critic else {
-            let values = 0;
-            return Self::new(bound, None, model.digest, values);
+            return Ok(Self { digest: model.digest, names_task, actor: bound, critic: None });
         };
         let critic_model = Model::load(path)?;
         let checked = check_pair(&model, &critic_model);
         checked.map_err(|source| refused(path, source))?;
         let critic = BoundNetwork::new(&critic_model, Role::Critic, layout);
         let critic = critic.map_err(|source| refused(path, source))?;
-        let n_values = critic.network().n_output;
+        check_critic(path, &critic)?;
         let digest = tandem_onnx::model::digest_of(&[&model.digest, &critic_model.digest]);
-        Self::new(bound, Some(critic), digest, n_values)
+        Ok(Self { digest, names_task, actor: bound, critic: Some(critic) })
     }
 
-    fn new(
-        actor: BoundNetwork,
-        critic: Option<BoundNetwork>,
-        digest: String,
-        n_values: usize,
-    ) -> Result<Self, Error> {
-        let n_arms = actor.layout().n_arms();
-        if n_arms != 1 || n_values > 1 {
-            return Err(Error::NotOneArm { n_arms, n_values });
-        }
-        Ok(Self { digest, actor, critic })
+    /// Returns whether the actor's metadata names the task. Otherwise it is the one that the vectors fit.
+    #[must_use]
+    pub const fn names_task(&self) -> bool {
+        self.names_task
     }
+}
+
+/// Refuses a network that takes no action, as an actor's, or has several values.
+fn check_critic(path: &Path, critic: &BoundNetwork) -> Result<(), Error> {
+    let n_outputs = critic.network().n_output;
+    if !critic.sources().iter().any(|source| matches!(source, Source::Action(_))) {
+        return Err(Error::NotACritic { path: path.to_owned(), n_outputs });
+    }
+    match n_outputs {
+        1 => Ok(()),
+        n_values => Err(Error::NotOneValue { policy: shown(path), n_values }),
+    }
+}
+
+fn shown(path: &Path) -> String {
+    format!("{path:?}")
 }
 
 fn refused(path: &Path, source: ModelError) -> Error {
@@ -154,7 +168,16 @@ mod tests {
         };
         assert_eq!(
             refusal(&actor, Some(&critic)),
-            "a teacher needs a policy that drives 1 arm and returns 1 value, this one drives 2 and returns 2"
+            format!("a teacher needs a policy that drives 1 arm, {actor:?} drives 2")
+        );
+        assert_eq!(
+            refusal(&actor, None),
+            format!("a teacher needs a policy that drives 1 arm, {actor:?} drives 2")
+        );
+        let two_arms = policy_file("student-push-classic.safetensors");
+        assert_eq!(
+            refusal(&two_arms, None),
+            format!("a teacher needs a policy that drives 1 arm, {two_arms:?} drives 2")
         );
         assert_eq!(
             refusal(&policy_file("teacher-push-classic.safetensors"), Some(&critic)),
@@ -168,6 +191,12 @@ mod tests {
                 "its metadata says push with 2 arms, the actor's says shared-push with 1 arm"
             ),
             "{mixed}"
+        );
+        assert_eq!(
+            refusal(&shared, Some(&shared)),
+            format!(
+                "{shared:?} is not a critic but an actor: it takes no action and returns 3 numbers"
+            )
         );
         let mut policy = Policy::load(&policy_file("teacher-push.safetensors")).unwrap();
         policy.critic[0] += 1.0;

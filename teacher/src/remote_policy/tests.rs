@@ -242,6 +242,22 @@ async fn without_values_a_strategy_that_compares_them_is_refused() {
 }
 
 #[tokio::test]
+async fn a_server_that_has_gone_is_named_once() {
+    let description = connected(&FakeServer::new(true)).await.description;
+    let closed = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+    let address = format!("http://{closed}");
+    let client = PolicyClient::new(ClientConfig::default().channel(&address).unwrap());
+    let connection =
+        Connection { client, address: address.clone(), description, timeouts: TIMEOUTS };
+    let (reply, _answer) = oneshot::channel();
+    let job = Job { n_states: 0, request: pb::EvaluatePolicyRequest::default(), reply };
+    let failed = connection.evaluate(&job, &mut Retrier::new(BACKOFF, EVALUATE)).await;
+    let message = failed.expect_err("nothing listens").to_string();
+    let expected = format!("the policy at {} does not answer: nothing listens", address);
+    assert!(message.starts_with(&expected), "{message}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_address_where_nothing_answers_is_reported_after_the_time_limit() {
     let timeouts = PolicyTimeouts { connect: Duration::from_millis(200), ..TIMEOUTS };
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
