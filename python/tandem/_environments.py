@@ -431,7 +431,7 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       reflection: a mirror symmetry of the world, with which each transition is learned from in two ways
         (`tandem.Reflection`).
       reports_contacts: whether infos have `arm_contact`, and optionally `table_contact`, which learning then charges. One
-        arm without `arm_contact` touches no other.
+        arm without `arm_contact` touches no other; infos without `table_contact` count as no contact with the table.
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
         with which its rewards agree.
       episode_steps: control steps per episode; by default `max_episode_steps` of its spec.
