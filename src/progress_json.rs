@@ -26,6 +26,7 @@ pub(crate) fn progress_json(progress: &pb::Progress) -> Value {
         "workers": progress.workers.iter().map(worker).collect::<Vec<_>>(),
         "ended": progress.ended, "end_reason": progress.end_reason, "digest": progress.digest,
         "warning": progress.warning, "environment": progress.environment,
+        "environment_failures": progress.environment_failures,
         "max_env_steps": progress.max_env_steps, "max_minutes": progress.max_minutes,
         "remaining_s": remaining_s(progress),
     })

@@ -136,6 +136,15 @@ pub(crate) fn grouped(number: u64) -> String {
     groups.join(",")
 }
 
+/// Describes the failures of environments on servers, if there were any.
+pub(crate) fn failures_text(progress: &pb::Progress) -> Option<String> {
+    match progress.environment_failures {
+        0 => None,
+        1 => Some("failed once, tandem.log has the cause".to_owned()),
+        n => Some(format!("failed {} times, tandem.log has the causes", grouped(n))),
+    }
+}
+
 /// Returns the line of a warning, or of its end if `warning` is empty.
 pub(crate) fn warning_line(progress: &pb::Progress) -> String {
     let clock = clock_text(progress.wall_s);
@@ -221,6 +230,16 @@ mod tests {
         assert_eq!(workers_text(&progress), "5 workers: 3 playing, 1 silent, 1 waiting");
         progress.workers.truncate(2);
         assert_eq!(workers_text(&progress), "w slot 1, w slot 2");
+    }
+
+    #[test]
+    fn failures_of_environments_are_counted() {
+        let of = |environment_failures| {
+            failures_text(&pb::Progress { environment_failures, ..Default::default() })
+        };
+        assert_eq!(of(0), None);
+        assert_eq!(of(1).as_deref(), Some("failed once, tandem.log has the cause"));
+        assert_eq!(of(1_300).as_deref(), Some("failed 1,300 times, tandem.log has the causes"));
     }
 
     #[test]

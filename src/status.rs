@@ -16,7 +16,9 @@ use crate::cli::StatusArgs;
 use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_json::progress_json;
-use crate::progress_text::{counts_line, evaluation_line, state_lines, warning_line};
+use crate::progress_text::{
+    counts_line, evaluation_line, failures_text, state_lines, warning_line,
+};
 use crate::run_display::Display;
 use crate::{access, call_failure, output, run_directory, runtime};
 
@@ -181,6 +183,7 @@ fn lines(progress: &pb::Progress) -> Vec<String> {
     if !progress.environment.is_empty() {
         lines.push(format!("environment: {}", progress.environment));
     }
+    lines.extend(failures_text(progress).map(|failures| format!("environment: {failures}")));
     if !progress.warning.is_empty() {
         lines.push(warning_line(progress));
     }

@@ -121,7 +121,9 @@ fn a_run_on_a_server_has_the_digest_of_the_same_run_without_it() {
     let result = summary(&train(&["--env", &server.address], &out));
     assert_eq!(result["digest"], IN_PROCESS["digest"]);
     assert_eq!(result["policy_digest"], IN_PROCESS["policy_digest"]);
-    assert_eq!(result["environment"], "deterministic (2 episodes checked)");
+    assert_eq!(result["environment"], "deterministic within a process (2 episodes played twice)");
+    assert_eq!(result["environment_failures"], 0);
+    assert_eq!(result["log"].as_str(), out.join("tandem.log").to_str());
     assert!(IN_PROCESS.get("environment").is_none(), "nothing to check in the worker's simulator");
 }
 
@@ -179,6 +181,7 @@ fn a_server_that_dies_during_a_run_changes_nothing() {
     kill(2);
     let result = summary(&run.wait_with_output().expect("ends"));
     assert_eq!(result["digest"], IN_PROCESS["digest"]);
+    assert!(result["environment_failures"].as_u64() > Some(0), "{result}");
 }
 
 #[test]
@@ -201,6 +204,19 @@ fn another_task_is_refused_before_anything_is_written() {
     let line = stderr(&refused);
     let expected =
         "serves another task than the run's: n_observation is 56 in the run and 28 at the server";
+    assert!(line.contains(expected) && line.lines().count() == 1, "{line}");
+    assert!(!out.exists());
+}
+
+#[test]
+fn a_server_with_too_few_environments_is_refused_before_anything_is_written() {
+    let server = Server::start(&["--max-environments", "4"]);
+    let (_keep, out) = run_directory();
+    let refused = train(&["--env", &server.address, "--set", "evaluation.episodes=240"], &out);
+    assert_eq!(refused.status.code(), Some(64), "{}", stderr(&refused));
+    let line = stderr(&refused);
+    let expected =
+        "serves 4 environments per stream, a slot has 8 episodes: serve at least 8 (`n` of";
     assert!(line.contains(expected) && line.lines().count() == 1, "{line}");
     assert!(!out.exists());
 }

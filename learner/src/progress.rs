@@ -48,17 +48,19 @@ pub(crate) struct Progress {
     pub(crate) end: Option<RunEnd>,
     /// Problems that require an operator; empty if there are none.
     pub(crate) warning: String,
-    /// The checks of environments on servers.
+    /// The checks of environments on servers, and their failures.
     pub(crate) environment: EnvironmentChecks,
 }
 
-/// The training episodes that workers have played twice on servers of environments.
+/// The training episodes that workers have played twice on servers of environments, and the failures of the servers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct EnvironmentChecks {
     /// Their number since the learner started.
     pub(crate) n_episodes: u64,
     /// True if one of them differed the second time.
     pub(crate) differs: bool,
+    /// Failed attempts to play since the learner started.
+    pub(crate) n_failures: u64,
 }
 
 impl EnvironmentChecks {
@@ -67,7 +69,7 @@ impl EnvironmentChecks {
         match (self.n_episodes, self.differs) {
             (0, _) => String::new(),
             (_, true) => "not deterministic".to_owned(),
-            (n, false) => format!("deterministic ({n} episodes checked)"),
+            (n, false) => format!("deterministic within a process ({n} episodes played twice)"),
         }
     }
 }

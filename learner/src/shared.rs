@@ -23,8 +23,12 @@ use crate::work_queue::{WorkQueue, Worker};
 /// Parameter versions that are kept for workers that lag behind.
 pub(crate) const KEPT_VERSIONS: usize = 16;
 
-/// Largest number of characters of a difference between two plays of an episode in the warning about it.
-const MAX_DIFFERENCE_CHARS: usize = 300;
+/// Largest number of characters of a worker's text in a warning: a difference between two plays of an episode, or the
+/// cause of a failure.
+const MAX_REPORT_CHARS: usize = 300;
+
+/// Failures of environments from which on there is a warning. Fewer follow from a server that is restarted.
+const MIN_FAILURES_OF_WARNING: u64 = 3;
 
 /// Returns the time since a fixed start. Passed in, so that nothing in this crate reads a clock.
 pub type Clock = Arc<dyn Fn() -> Duration + Send + Sync>;
@@ -140,16 +144,28 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds the result of playing episodes twice to the progress, with a warning about the first difference.
+    /// Adds the result of playing episodes twice and the failures of a server to the progress, with a warning about the
+    /// first difference, and one once failures are frequent.
     pub(crate) fn record_environment_check(&self, check: &pb::EnvironmentCheck) {
         self.progress.send_modify(|progress| {
             progress.environment.n_episodes += u64::from(check.n_episodes);
             progress.environment.differs |= !check.difference.is_empty();
+            progress.environment.n_failures += u64::from(check.failures);
         });
+        let shown = |text: &str| text.chars().take(MAX_REPORT_CHARS).collect::<String>();
         if !check.difference.is_empty() {
-            let difference: String = check.difference.chars().take(MAX_DIFFERENCE_CHARS).collect();
-            let warning = format!("the environments are not deterministic: {difference}");
+            let warning =
+                format!("the environments are not deterministic: {}", shown(&check.difference));
             self.warnings.set_first(Source::Environment, &warning);
+        }
+        let n_failures = self.progress.borrow().environment.n_failures;
+        if check.failures > 0 && n_failures >= MIN_FAILURES_OF_WARNING {
+            let warning = format!(
+                "the environments have failed {n_failures} times, their episodes are played again; the latest \
+                 failure, of the server {}",
+                shown(&check.failure)
+            );
+            self.warnings.set_first(Source::Failures, &warning);
         }
     }
 

@@ -16,6 +16,8 @@ pub(crate) enum Source {
     Advice,
     /// Environments that do not repeat their episodes.
     Environment,
+    /// Environments that fail repeatedly.
+    Failures,
     /// A statistic of the normalisers is out of all proportion.
     Statistics,
     /// The teacher.

@@ -66,7 +66,7 @@ pub(crate) fn worker_failed(error: Error) -> Failed {
         | E::OtherTask { .. }
         | E::TooFewEnvironments { .. } => Exit::Usage,
         E::EnvironmentRefused { ref status, .. } if is_configuration(status) => Exit::Usage,
-        E::InvalidReply { .. } | E::EnvironmentRefused { .. } => Exit::Data,
+        E::InvalidReply { .. } | E::EpisodeLost { .. } | E::EnvironmentRefused { .. } => Exit::Data,
         E::Rollout { .. } | E::World(_) | E::Panicked(_) | E::NoAccount { .. } | E::NoServer => {
             Exit::Bug
         }

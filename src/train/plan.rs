@@ -228,11 +228,14 @@ fn named_config(
     Ok((config, directory))
 }
 
-/// Rejects a task that neither the server nor the simulator has.
+/// Rejects a task that neither the server nor the simulator has, and a server with too few environments for a slot.
 fn check_environment(config: &RunConfig, served: Option<&ServedTask>) -> Result<(), Failed> {
     let task = config.layout().or_exit(Exit::Usage, String::new)?;
     match served {
-        Some(served) => served.check(&task).map_err(worker_failed),
+        Some(served) => {
+            served.check(&task).map_err(worker_failed)?;
+            served.check_room(config.largest_slot()).map_err(worker_failed)
+        }
         None if task.as_built_in().is_none() => Err(Failed::usage(format!(
             "task {:?} is not built-in: name the server of its environments with --env or --env-command",
             task.name()

@@ -15,7 +15,7 @@ use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::progress_text::{advice_text, clock_text, grouped};
+use crate::progress_text::{advice_text, clock_text, failures_text, grouped};
 use crate::run_pages::RunPages;
 use crate::shell::{shell_text, shell_word};
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
@@ -134,6 +134,7 @@ fn summary_lines(
     if !last.environment.is_empty() {
         lines.push(format!("environment   {}", last.environment));
     }
+    lines.extend(failures_text(last).map(|failures| format!("environment   {failures}")));
     let teacher = match memory.teacher_mib {
         0 => String::new(),
         mib => format!("teacher {mib} MiB, "),
@@ -246,9 +247,13 @@ fn summary_json(
         "policy": plan.best_policy().to_string_lossy(),
         "digest": last.digest,
         "max_env_steps": plan.config.stop.max_env_steps,
+        "log": plan.log_path().to_string_lossy(),
     });
     if !last.environment.is_empty() {
         summary["environment"] = last.environment.as_str().into();
+    }
+    if names_server(&plan.environment) {
+        summary["environment_failures"] = last.environment_failures.into();
     }
     if let (Some(summary), Value::Object(more)) = (summary.as_object_mut(), more) {
         summary.extend(more);

@@ -1,6 +1,7 @@
 //! The client of a server of environments.
 
 use tandem_core::TaskSpec;
+use tandem_core::text::shortened;
 use tandem_core::work::EpisodeStart;
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, Retryability, within};
 use tandem_proto::environment::{
@@ -11,7 +12,7 @@ use tandem_proto::pb::environment_client::EnvironmentClient;
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming};
+use tonic::{Code, Status, Streaming};
 
 use crate::config::EnvironmentConfig;
 use crate::error::Error;
@@ -23,6 +24,8 @@ const PLAY: Operation =
 const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
+/// The largest number of characters of the cause of a failure in reports.
+const MAX_CAUSE_CHARS: usize = 200;
 
 /// A server of environments and its task.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,6 +34,8 @@ pub struct ServedTask {
     pub server: String,
     /// The task of its environments.
     pub task: TaskSpec,
+    /// The largest number of environments of a slot.
+    pub max_environments: usize,
 }
 
 impl ServedTask {
@@ -41,6 +46,18 @@ impl ServedTask {
     pub fn check(&self, run: &TaskSpec) -> Result<(), Error> {
         let Some(difference) = run.difference(&self.task) else { return Ok(()) };
         Err(Error::OtherTask { server: self.server.clone(), difference })
+    }
+
+    /// Checks that the server has an environment for each of the `needed` episodes of a slot.
+    ///
+    /// # Errors
+    /// When it has fewer.
+    pub fn check_room(&self, needed: usize) -> Result<(), Error> {
+        if needed <= self.max_environments {
+            return Ok(());
+        }
+        let (server, max) = (self.server.clone(), self.max_environments);
+        Err(Error::TooFewEnvironments { server, max, needed })
     }
 }
 
@@ -68,6 +85,8 @@ pub(crate) struct Environments {
     retrier: Retrier,
     /// Failures since a slot was played.
     n_failures: u32,
+    /// Failures that were not reported yet.
+    unreported: Failures,
     /// The name of the latest server in messages: its address and program.
     name: String,
     was_connected: bool,
@@ -83,7 +102,6 @@ pub(crate) struct Environments {
 struct Server {
     client: EnvironmentClient<AuthChannel>,
     served: ServedTask,
-    max_environments: usize,
 }
 
 #[derive(Debug)]
@@ -91,6 +109,15 @@ struct PlayStream {
     n: usize,
     requests: mpsc::Sender<pb::PlayRequest>,
     responses: Streaming<pb::PlayResponse>,
+}
+
+/// Failed attempts to play on a server.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Failures {
+    /// Their number.
+    pub(crate) n: u32,
+    /// The server and the cause of the latest one, on one line; empty if there is none.
+    pub(crate) latest: String,
 }
 
 /// The failure of a call.
@@ -109,6 +136,7 @@ impl Environments {
             config,
             retrier: Retrier::new(EnvironmentConfig::BACKOFF, PLAY),
             n_failures: 0,
+            unreported: Failures::default(),
             name: "of the worker".to_owned(),
             was_connected: false,
             server: None,
@@ -125,7 +153,7 @@ impl Environments {
             match self.connect().await {
                 Ok(server) => {
                     server.served.check(task)?;
-                    return Ok(server.max_environments);
+                    return Ok(server.served.max_environments);
                 }
                 Err(failure) => self.recover(failure).await?,
             }
@@ -174,10 +202,11 @@ impl Environments {
         decode_step_reply(&reply, n, task).map_err(|error| self.invalid(error))
     }
 
-    /// Records that a slot was played.
-    pub(crate) async fn succeed(&mut self) {
+    /// Records that a slot was played. Returns the failures since the previous one.
+    pub(crate) async fn succeed(&mut self) -> Failures {
         self.n_failures = 0;
         self.retrier.settle(Ok(())).await;
+        std::mem::take(&mut self.unreported)
     }
 
     /// Waits before the next attempt after a failure.
@@ -191,6 +220,9 @@ impl Environments {
             Failure::Final(error) => return Err(*error),
         };
         self.n_failures += 1;
+        self.unreported.n += 1;
+        let cause = shortened(&status.message().replace(char::is_control, " "), MAX_CAUSE_CHARS);
+        self.unreported.latest = format!("{}: {cause}", self.name);
         if self.n_failures >= self.config.max_attempts {
             let (server, n_failures) = (self.name.clone(), self.n_failures);
             return Err(Error::EnvironmentFailed { server, n_failures, status });
@@ -211,11 +243,7 @@ impl Environments {
         let server = self.connect().await?;
         // The server may have been replaced since the last call.
         server.served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
-        if n > server.max_environments {
-            let (server, max) = (server.served.server.clone(), server.max_environments);
-            let error = Error::TooFewEnvironments { server, max, needed: n };
-            return Err(Failure::Final(Box::new(error)));
-        }
+        server.served.check_room(n).map_err(|error| Failure::Final(Box::new(error)))?;
         let exchanged = within(reply_timeout, async {
             let mut stream = match stream {
                 Some(stream) => {
@@ -227,7 +255,7 @@ impl Environments {
             let response = stream.responses.message().await?.ok_or_else(closed)?;
             Ok((stream, response))
         });
-        let (stream, response) = exchanged.await.map_err(|status| self.failure(status))?;
+        let (stream, response) = exchanged.await.map_err(|status| self.play_failure(status))?;
         self.stream = Some(stream);
         Ok(response)
     }
@@ -272,8 +300,12 @@ impl Environments {
         self.name = format!("{address} ({program})");
         tracing::info!(server = self.name, "environment server connected");
         self.was_connected = true;
-        let served = ServedTask { server: self.name.clone(), task: description.task };
-        Ok(Server { client, served, max_environments: description.max_environments })
+        let served = ServedTask {
+            server: self.name.clone(),
+            task: description.task,
+            max_environments: description.max_environments,
+        };
+        Ok(Server { client, served })
     }
 
     fn failure(&self, status: Status) -> Failure {
@@ -286,13 +318,29 @@ impl Environments {
         }
     }
 
+    /// The failure of a request to play. A server that answers with `DATA_LOSS` would do so again.
+    fn play_failure(&self, status: Status) -> Failure {
+        match status.code() {
+            Code::DataLoss => {
+                let (server, reply) = (self.name.clone(), self.latest_request());
+                Failure::Final(Box::new(Error::EpisodeLost { server, reply, status }))
+            }
+            _ => self.failure(status),
+        }
+    }
+
     /// The failure of a server whose reply no environment of the task can give. It would give it again.
     fn invalid(&self, source: DecodeError) -> Failure {
-        let reply = match self.n_steps {
+        let (server, reply) = (self.name.clone(), self.latest_request());
+        Failure::Final(Box::new(Error::InvalidReply { server, reply, source }))
+    }
+
+    /// Describes the latest request to play, from which the seeds of its episodes follow.
+    fn latest_request(&self) -> String {
+        match self.n_steps {
             0 => format!("the reset of episodes {:?}", self.episodes),
             step => format!("step {step} of episodes {:?}", self.episodes),
-        };
-        Failure::Final(Box::new(Error::InvalidReply { server: self.name.clone(), reply, source }))
+        }
     }
 }
 

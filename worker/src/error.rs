@@ -63,7 +63,7 @@ pub enum Error {
     },
     /// The server serves fewer environments than a slot has episodes.
     #[error(
-        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: serve rounds.rollouts of them, and at least 8 for evaluations"
+        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: serve at least {needed} (`n` of tandem.serve, --max-environments of tandem env), and 8 for evaluations"
     )]
     TooFewEnvironments {
         /// Address and program of the server.
@@ -90,6 +90,19 @@ pub enum Error {
         reply: String,
         /// The field and its value.
         source: DecodeError,
+    },
+    /// The environment server ended an episode that would fail again, as after a number that is not finite.
+    #[error(
+        "the environment server {server} sent an invalid reply to {reply}: {}",
+        status.message()
+    )]
+    EpisodeLost {
+        /// Address and program of the server.
+        server: String,
+        /// The request: the episodes by environment, and the step.
+        reply: String,
+        /// The cause, in the words of the server.
+        status: Status,
     },
     /// A bug: a slot was to be played on a server, but the worker has none.
     #[error("the worker has no environment server")]

@@ -103,10 +103,7 @@ impl Learner {
         trace: TraceContext,
     ) -> Result<Option<()>, Error> {
         let episodes = played.episodes.iter().map(tandem_proto::encode_episode).collect();
-        let environment_check = played.check.map(|check| pb::EnvironmentCheck {
-            n_episodes: check.n_episodes,
-            difference: check.difference.map_or_else(String::new, |it| it.to_string()),
-        });
+        let environment_check = environment_report(played);
         let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check };
         let call = |mut client: Client, request| async move {
             let mut request = Request::new(request);
@@ -132,6 +129,20 @@ impl Learner {
         let response = retry(self.timeouts.backoff, deadline, operation, attempt).await;
         response.map(Response::into_inner)
     }
+}
+
+/// Returns the check of the environments and the failures of their server, if there is anything to report.
+fn environment_report(played: &PlayedSlot) -> Option<pb::EnvironmentCheck> {
+    if played.check.is_none() && played.failures.n == 0 {
+        return None;
+    }
+    let difference = played.check.and_then(|check| check.difference);
+    Some(pb::EnvironmentCheck {
+        n_episodes: played.check.map_or(0, |check| check.n_episodes),
+        difference: difference.map_or_else(String::new, |it| it.to_string()),
+        failures: played.failures.n,
+        failure: played.failures.latest.clone(),
+    })
 }
 
 fn decode_work(response: pb::NextWorkResponse) -> Result<Work, DecodeError> {

@@ -9,6 +9,7 @@ use tandem_telemetry::events::EpisodeFinished;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::determinism::{self, DeterminismCheck};
+use crate::environment::Failures;
 use crate::error::Error;
 use crate::metrics::{Measured, WorkerMetrics};
 use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
@@ -37,6 +38,8 @@ pub(crate) struct PlayedSlot {
     pub(crate) episodes: Vec<Episode>,
     /// The result of playing the slot twice, if it was.
     pub(crate) check: Option<DeterminismCheck>,
+    /// The failures of the server before the slot was played.
+    pub(crate) failures: Failures,
 }
 
 impl Player {
@@ -137,7 +140,7 @@ impl Player {
             finished_event(episode).emit();
             self.record(*ordered, episode, traces.next());
         }
-        Ok(PlayedSlot { episodes, check })
+        Ok(PlayedSlot { episodes, check, failures: Failures::default() })
     }
 
     /// Passes an episode to the recorder, if its order asks for a log or it has a trace.

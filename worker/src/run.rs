@@ -244,9 +244,9 @@ impl Worker {
         loop {
             let (returned, outcome) = self.try_play(player, order.clone(), trace).await?;
             match (outcome, &mut self.environments) {
-                (Ok(played), environments) => {
+                (Ok(mut played), environments) => {
                     if let Some(environments) = environments {
-                        environments.succeed().await;
+                        played.failures = environments.succeed().await;
                     }
                     self.log_difference(&played);
                     return Ok((returned, played));

@@ -34,6 +34,7 @@ pub(super) fn encode_progress(progress: &Progress) -> pb::Progress {
         digest: end.and_then(|end| end.digest.clone()).unwrap_or_default(),
         warning: progress.warning.clone(),
         environment: progress.environment.text(),
+        environment_failures: progress.environment.n_failures,
         max_env_steps: progress.max_env_steps,
         max_minutes: progress.max_minutes,
     }

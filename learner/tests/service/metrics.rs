@@ -5,14 +5,14 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use tandem_learner::{LingerPolicy, ServeOptions, serve_with};
-use tandem_proto::pb;
+use tandem_proto::{encode_episode, pb};
 use tandem_telemetry::RunView;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::service_tests::run::{DEADLINE, Toy, client_of, learner_config};
+use crate::service_tests::run::{DEADLINE, Served, Toy, client_of, learner_config};
 use crate::service_tests::toy;
 
 /// Returns the values at `/metrics` by name and labels.
@@ -66,6 +66,36 @@ async fn shows_the_end(mut view: watch::Receiver<RunView>, status: &pb::Progress
     assert!(!view.evaluated.is_empty());
     let n_acted: u64 = view.acted.iter().map(|arm| arm.student + arm.teacher).sum();
     assert_eq!(n_acted, status.env_steps);
+}
+
+#[tokio::test]
+async fn failures_of_environments_are_counted_and_warned_of_once() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
+    let mut toy = served.join("toy").await;
+    let first = "the environments have failed 3 times, their episodes are played again; the latest failure, of the \
+                 server http://x:1 (fake): boom 1";
+    for (failures, total, warning) in [(2, 2, ""), (1, 3, first), (5, 8, first)] {
+        let (order, episodes) = toy.take().await.expect("a slot");
+        let check = pb::EnvironmentCheck {
+            failures,
+            failure: format!("http://x:1 (fake): boom {failures}"),
+            ..Default::default()
+        };
+        let request = pb::SubmitEpisodesRequest {
+            worker_id: toy.id,
+            slot: order.slot,
+            episodes: episodes.iter().map(encode_episode).collect(),
+            environment_check: Some(check),
+        };
+        toy.client.submit_episodes(request).await.expect("taken");
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
+        let progress = progress.into_inner();
+        assert_eq!((progress.environment_failures, progress.warning.as_str()), (total, warning));
+        assert_eq!(progress.environment, "", "nothing was played twice");
+    }
+    while toy.play_one().await {}
+    served.end().await.expect("the run ends");
 }
 
 #[tokio::test]

@@ -70,7 +70,8 @@ class EnvironmentServicer(object):
 
         An episode depends only on its reset and on the actions, not on earlier episodes or on other environments. A
         malformed request ends the stream with INVALID_ARGUMENT and a message that names the field; a failure of an
-        environment ends it with INTERNAL; a server without room answers the first request with RESOURCE_EXHAUSTED.
+        environment ends it with INTERNAL, or with DATA_LOSS if the same episode would fail again, as after a number that
+        is not finite; a server without room answers the first request with RESOURCE_EXHAUSTED.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -200,12 +200,16 @@ class SubmitEpisodesRequest(_message.Message):
     def __init__(self, worker_id: _Optional[int] = ..., slot: _Optional[int] = ..., episodes: _Optional[_Iterable[_Union[Episode, _Mapping]]] = ..., environment_check: _Optional[_Union[EnvironmentCheck, _Mapping]] = ...) -> None: ...
 
 class EnvironmentCheck(_message.Message):
-    __slots__ = ("n_episodes", "difference")
+    __slots__ = ("n_episodes", "difference", "failures", "failure")
     N_EPISODES_FIELD_NUMBER: _ClassVar[int]
     DIFFERENCE_FIELD_NUMBER: _ClassVar[int]
+    FAILURES_FIELD_NUMBER: _ClassVar[int]
+    FAILURE_FIELD_NUMBER: _ClassVar[int]
     n_episodes: int
     difference: str
-    def __init__(self, n_episodes: _Optional[int] = ..., difference: _Optional[str] = ...) -> None: ...
+    failures: int
+    failure: str
+    def __init__(self, n_episodes: _Optional[int] = ..., difference: _Optional[str] = ..., failures: _Optional[int] = ..., failure: _Optional[str] = ...) -> None: ...
 
 class SubmitEpisodesResponse(_message.Message):
     __slots__ = ()
@@ -246,7 +250,7 @@ class WatchRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class Progress(_message.Message):
-    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "advice_queries", "resumed_from_round", "max_env_steps", "max_minutes")
+    __slots__ = ("task", "n_arms", "strategy", "round", "env_steps", "episodes", "updates", "wall_s", "env_steps_per_s", "updates_per_s", "advice_spent", "budget_left", "phase", "training_success", "workers", "evaluation", "best", "ended", "end_reason", "digest", "warning", "environment", "advice_queries", "resumed_from_round", "max_env_steps", "max_minutes", "environment_failures")
     TASK_FIELD_NUMBER: _ClassVar[int]
     N_ARMS_FIELD_NUMBER: _ClassVar[int]
     STRATEGY_FIELD_NUMBER: _ClassVar[int]
@@ -273,6 +277,7 @@ class Progress(_message.Message):
     RESUMED_FROM_ROUND_FIELD_NUMBER: _ClassVar[int]
     MAX_ENV_STEPS_FIELD_NUMBER: _ClassVar[int]
     MAX_MINUTES_FIELD_NUMBER: _ClassVar[int]
+    ENVIRONMENT_FAILURES_FIELD_NUMBER: _ClassVar[int]
     task: str
     n_arms: int
     strategy: str
@@ -299,7 +304,8 @@ class Progress(_message.Message):
     resumed_from_round: int
     max_env_steps: int
     max_minutes: float
-    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., advice_queries: _Optional[int] = ..., resumed_from_round: _Optional[int] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ...) -> None: ...
+    environment_failures: int
+    def __init__(self, task: _Optional[str] = ..., n_arms: _Optional[int] = ..., strategy: _Optional[str] = ..., round: _Optional[int] = ..., env_steps: _Optional[int] = ..., episodes: _Optional[int] = ..., updates: _Optional[int] = ..., wall_s: _Optional[float] = ..., env_steps_per_s: _Optional[float] = ..., updates_per_s: _Optional[float] = ..., advice_spent: _Optional[int] = ..., budget_left: _Optional[int] = ..., phase: _Optional[str] = ..., training_success: _Optional[float] = ..., workers: _Optional[_Iterable[_Union[WorkerProgress, _Mapping]]] = ..., evaluation: _Optional[_Union[Evaluation, _Mapping]] = ..., best: _Optional[_Union[Evaluation, _Mapping]] = ..., ended: bool = ..., end_reason: _Optional[str] = ..., digest: _Optional[str] = ..., warning: _Optional[str] = ..., environment: _Optional[str] = ..., advice_queries: _Optional[int] = ..., resumed_from_round: _Optional[int] = ..., max_env_steps: _Optional[int] = ..., max_minutes: _Optional[float] = ..., environment_failures: _Optional[int] = ...) -> None: ...
 
 class WorkerProgress(_message.Message):
     __slots__ = ("worker_id", "name", "episodes", "doing")

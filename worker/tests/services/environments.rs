@@ -106,6 +106,31 @@ async fn a_server_that_refuses_is_not_asked_again() {
 }
 
 #[tokio::test]
+async fn an_episode_that_a_server_ends_for_good_is_named_like_an_invalid_reply() {
+    let reason = "environment 1: observation[0] is nan, beyond its bound 10";
+    for (nth, reply) in [(0, "the reset of episodes [0, 1]"), (7, "step 7 of episodes [0, 1]")] {
+        let lost = Fault::End(Status::data_loss(reason));
+        let line = line_of_end(FakeEnvironments::default().with_fault(nth, lost)).await;
+        let expected = format!("(fake 1.0) sent an invalid reply to {reply}: {reason}");
+        assert!(line.ends_with(&expected), "{line}");
+    }
+}
+
+#[tokio::test]
+async fn failures_of_a_server_are_reported_with_the_next_slot() {
+    let failing = |nth, message| FakeEnvironments::default().with_fault(nth, ending(message));
+    let environments = failing(20, "boom\nsecond line").with_fault(40, ending("boom again"));
+    let (ended, _, learner) = play_on(&Arc::new(environments), |config| config).await;
+    ended.expect("the run ends");
+    let failures = learner.failures();
+    let [(2, latest)] = &failures[..] else { panic!("{failures:?}") };
+    assert!(latest.ends_with(" (fake 1.0): boom again"), "{latest}");
+    let (ended, _, learner) = play_on(&Arc::new(failing(20, "boom\nsecond line")), |it| it).await;
+    ended.expect("the run ends");
+    assert!(learner.failures()[0].1.ends_with(": boom second line"), "on one line");
+}
+
+#[tokio::test]
 async fn an_invalid_reply_ends_the_worker_with_server_environment_field_and_value() {
     let check = async |nth, spoil, reply: &str, reason: &str| {
         let environments = FakeEnvironments::default().with_fault(nth, Fault::Spoil(spoil));
@@ -230,14 +255,14 @@ async fn a_server_is_asked_for_its_task() {
     let server = Server::environments(&environments);
     let served = describe_environments(played_on(&server)).await.expect("answered");
     let expected = format!("http://{} (fake 1.0)", server.address());
-    assert_eq!((served.server, served.task), (expected, task));
+    assert_eq!((served.server, served.task, served.max_environments), (expected, task, 2));
 }
 
 #[tokio::test]
 async fn a_server_with_too_few_environments_is_refused() {
     let line = line_of_end(FakeEnvironments::default().with_room_for(1)).await;
     let expected =
-        "serves 1 environments per stream, a slot has 2 episodes: serve rounds.rollouts of them";
+        "serves 1 environments per stream, a slot has 2 episodes: serve at least 2 (`n` of";
     assert!(line.contains(expected), "{line}");
 }
 

@@ -50,6 +50,7 @@ struct State {
     n_calls: BTreeMap<Call, usize>,
     episodes: BTreeMap<(bool, u64), Episode>,
     checks: Vec<(u32, String)>,
+    failures: Vec<(u32, String)>,
 }
 
 impl State {
@@ -76,6 +77,7 @@ impl FakeLearner {
             n_calls: BTreeMap::new(),
             episodes: BTreeMap::new(),
             checks: Vec::new(),
+            failures: Vec::new(),
         };
         Self { terms: terms(), state: Mutex::new(state), fault: None }
     }
@@ -111,6 +113,11 @@ impl FakeLearner {
     /// Returns the delivered checks of environments: the number of episodes and the difference.
     pub(crate) fn checks(&self) -> Vec<(u32, String)> {
         self.state().checks.clone()
+    }
+
+    /// Returns the delivered failures of environments: their number and the latest one.
+    pub(crate) fn failures(&self) -> Vec<(u32, String)> {
+        self.state().failures.clone()
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -209,8 +216,14 @@ impl pb::learner_server::Learner for FakeLearner {
         let mut state = self.state();
         state.check_known(request.worker_id)?;
         if state.out.remove(&request.slot).is_some() {
-            let check = request.environment_check;
-            state.checks.extend(check.map(|check| (check.n_episodes, check.difference)));
+            if let Some(check) = request.environment_check {
+                if check.n_episodes > 0 {
+                    state.checks.push((check.n_episodes, check.difference));
+                }
+                if check.failures > 0 {
+                    state.failures.push((check.failures, check.failure));
+                }
+            }
             for message in request.episodes {
                 let episode = tandem_proto::decode_episode(message, &self.terms.layout)?;
                 let key = (episode.kind == EpisodeKind::Evaluation, episode.number);
