@@ -8,6 +8,9 @@ use tonic::Status;
 
 use crate::rollout::RolloutError;
 
+/// The most episodes of a slot of a run's evaluation.
+const EVALUATION_EPISODES: usize = 8;
+
 /// An error that ends a worker. Waiting does not cure any of them.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -63,7 +66,8 @@ pub enum Error {
     },
     /// The server serves fewer environments than a slot has episodes.
     #[error(
-        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: serve at least {needed} (`n` of tandem.serve, --max-environments of tandem env), and 8 for evaluations"
+        "the environment server {server} serves {max} environments per stream, a slot has {needed} episodes: serve at least {} (`n` of tandem.serve, --max-environments of tandem env)",
+        EVALUATION_EPISODES.max(*needed)
     )]
     TooFewEnvironments {
         /// Address and program of the server.

@@ -253,7 +253,7 @@ async fn a_server_that_has_gone_is_named_once() {
     let job = Job { n_states: 0, request: pb::EvaluatePolicyRequest::default(), reply };
     let failed = connection.evaluate(&job, &mut Retrier::new(BACKOFF, EVALUATE)).await;
     let message = failed.expect_err("nothing listens").to_string();
-    let expected = format!("the policy at {} does not answer: nothing listens", address);
+    let expected = format!("the policy at {address} does not answer: nothing listens");
     assert!(message.starts_with(&expected), "{message}");
 }
 

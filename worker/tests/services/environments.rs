@@ -262,7 +262,7 @@ async fn a_server_is_asked_for_its_task() {
 async fn a_server_with_too_few_environments_is_refused() {
     let line = line_of_end(FakeEnvironments::default().with_room_for(1)).await;
     let expected =
-        "serves 1 environments per stream, a slot has 2 episodes: serve at least 2 (`n` of";
+        "serves 1 environments per stream, a slot has 2 episodes: serve at least 8 (`n` of";
     assert!(line.contains(expected), "{line}");
 }
 
