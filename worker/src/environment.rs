@@ -16,7 +16,7 @@ use tonic::{Code, Status, Streaming};
 
 use crate::config::EnvironmentConfig;
 use crate::error::Error;
-use crate::player::PeerRequest;
+use crate::player::{Failures, PeerRequest};
 
 const PLAY: Operation =
     Operation { peer: "environment server", purpose: "play in the environments of the server" };
@@ -109,15 +109,6 @@ struct PlayStream {
     n: usize,
     requests: mpsc::Sender<pb::PlayRequest>,
     responses: Streaming<pb::PlayResponse>,
-}
-
-/// Failed attempts to play on a server.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Failures {
-    /// Their number.
-    pub(crate) n: u32,
-    /// The server and the cause of the latest one, on one line; empty if there is none.
-    pub(crate) latest: String,
 }
 
 /// The failure of a call.

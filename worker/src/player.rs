@@ -9,7 +9,6 @@ use tandem_telemetry::events::EpisodeFinished;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::determinism::{self, DeterminismCheck};
-use crate::environment::Failures;
 use crate::error::Error;
 use crate::metrics::{Measured, WorkerMetrics};
 use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
@@ -40,6 +39,15 @@ pub(crate) struct PlayedSlot {
     pub(crate) check: Option<DeterminismCheck>,
     /// The failures of the server before the slot was played.
     pub(crate) failures: Failures,
+}
+
+/// Failed attempts to play on a server.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Failures {
+    /// Their number.
+    pub(crate) n: u32,
+    /// The server and the cause of the latest one, on one line; empty if there is none.
+    pub(crate) latest: String,
 }
 
 impl Player {
