@@ -25,7 +25,7 @@ SHIPPED = [
     for world in ("", "-classic")
     for task in ("push", "pick-and-place")
     for role in ("student", "teacher")
-]
+] + [ROOT / "policies" / "student-carry-bar.safetensors"]
 # For each world the control steps in which hands rise above the objects before their free motion is compared.
 RISING_STEPS = {"shared": 2, "classic": 5}
 # Tasks and numbers of arms whose motion without contact is compared.
@@ -60,19 +60,16 @@ class Policy:
         return np.tanh(network(self.tensors, "actor", self.n_layers, rows)).ravel()
 
 
-def tandem(program, *arguments):
-    """The output of `tandem scene` with `arguments`."""
-    command = [str(program), "scene", "--json", *map(str, arguments)]
+def tandem(program, *arguments, command=("scene", "--json")):
+    """The JSON that `tandem scene`, or another command, prints with `arguments`."""
+    command = [str(program), *command, *map(str, arguments)]
     try:
         done = subprocess.run(command, capture_output=True, check=True, text=True)
     except FileNotFoundError:
         raise Wrong(f"{program} does not exist: build it with `cargo build --release`, or give --tandem") from None
     except subprocess.CalledProcessError as error:
         raise Wrong(error.stderr.strip() or f"{program} ended with {error.returncode}") from None
-    scene = json.loads(done.stdout)
-    if scene["world"]["task"] == "carry-bar":
-        raise Wrong("carry-bar: MuJoCo plays tasks of which every arm has a cube of its own")
-    return scene
+    return json.loads(done.stdout)
 
 
 def wilson(hits, n):
@@ -84,10 +81,27 @@ def wilson(hits, n):
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
 
 
-def goal_distances(world, observation, goal):
-    """The distance of every object to its goal, metres."""
-    things = np.reshape(observation, (len(world["arms"]), 28))[:, 3:6]
-    return np.linalg.norm(things - np.reshape(goal, (-1, 3)), axis=1)
+def goal_distances(world, observations, goal):
+    """The distance of every object to its goal, metres, [steps, arms]."""
+    things = np.reshape(observations, (len(observations), len(world["arms"]), 28))[:, :, 3:6]
+    return np.linalg.norm(things - np.reshape(goal, (-1, 3)), axis=2)
+
+
+def manipulation(world, program):
+    """What success needs beyond the distances to the goals, from the description of the task: the number of last steps
+    after which it must hold, and conditions on the observation.
+    """
+    if world["task"] != "carry-bar":
+        return 1, []
+    description = tandem(program, "--describe", "--task", "carry-bar", command=("env",))["manipulation"]
+    arms = description["arms"]
+    return description["success_steps"], [one for arm in arms for one in (*arm["holding"], *arm["conditions"])]
+
+
+def holds(condition, observations):
+    """Whether numbers of each observation are within the tolerance of their target; without one, of zero."""
+    numbers = observations[:, condition["numbers"]]
+    return np.linalg.norm(numbers - (condition["target"] or 0.0), axis=1) <= condition["tolerance"]
 
 
 def play(world_in_mujoco, episode, choose_action):
@@ -153,12 +167,16 @@ def transfer(path, arguments):
     label = f"{world['task']}, {'2 copies of ' if one_arm else ''}{path.stem.split('-')[0]}"
     played = play_all(scene, contact_model(arguments), path, play_policy, label, arguments)
 
-    def achieved(observation, goal):
-        return bool((goal_distances(world, observation, goal) <= world["goal_tolerance_m"]).all())
+    n_steps, conditions = manipulation(world, arguments.tandem)
+
+    def achieved(observations, goal):
+        last = np.array(observations[-n_steps:])
+        is_near = (goal_distances(world, last, goal) <= world["goal_tolerance_m"]).all()
+        return bool(is_near and all(holds(condition, last).all() for condition in conditions))
 
     goals = [episode["goal"] for episode in scene["episodes"]]
-    in_rapier = [achieved(episode["observations"][-1], goal) for episode, goal in zip(scene["episodes"], goals)]
-    in_mujoco = [achieved(observations[-1], goal) for (observations, _), goal in zip(played, goals)]
+    in_rapier = [achieved(episode["observations"], goal) for episode, goal in zip(scene["episodes"], goals)]
+    in_mujoco = [achieved(observations, goal) for (observations, _), goal in zip(played, goals)]
     return {
         "task": world["task"],
         "arms": len(world["arms"]),
@@ -277,7 +295,7 @@ def parse(argv):
     )
     default = ContactModel()
     parser.add_argument(
-        "policies", nargs="*", type=Path, metavar="FILE", help="policies [default: the eight shipped ones]"
+        "policies", nargs="*", type=Path, metavar="FILE", help="policies [default: the nine shipped ones]"
     )
     parser.add_argument("--arms", type=int, choices=(1, 2), help="2: one-arm policies control two arms, each its own")
     parser.add_argument("--episodes", type=int, default=240, help="goals per policy [default: 240]")

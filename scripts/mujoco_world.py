@@ -124,6 +124,10 @@ class Arm:
         self.finger_dofs = np.array([dof(model, finger["body"]) for finger in self.fingers], dtype=int)
         self.finger_axes = self.finger_dofs[:, None] + np.arange(3)
         self.object_qpos = model.jnt_qposadr[model.body_jntadr[model.body(f"body{description['object']}").id]]
+        # The point of the object that the arm brings to its goal, in the object's frame: its centre, or a handle.
+        self.object_point = np.array(description["object_point_m"])
+        # An object of both arms looks the same to both.
+        self.is_shared = len({arm["object"] for arm in world["arms"]}) < len(world["arms"])
         # Places of the closed fingers and directions of opening in the palm's frame.
         self.closed_offsets = np.array([self.sign * finger["closed_offset_m"] for finger in self.fingers])
         self.outward = self.sign[1] * np.array([finger["outward"] for finger in self.fingers])
@@ -156,13 +160,24 @@ class Arm:
     def orientation_in_arm(self, wxyz):
         """A body's orientation in the arm's frame as (x, y, z, w) with w >= 0."""
         w, x, y, z = wxyz
-        in_arm = np.array([x, y, z, w] if self.sign[0] > 0 else [-y, x, w, -z])
+        if self.sign[0] > 0:
+            in_arm = np.array([x, y, z, w])
+        else:
+            in_arm = np.array([-x, -y, z, w] if self.is_shared else [-y, x, w, -z])
         return -in_arm if in_arm[3] < 0.0 else in_arm
 
     def orientation_in_world(self, xyzw):
         """A body's orientation as (w, x, y, z), from that in the arm's frame."""
         x, y, z, w = xyzw
-        return [w, x, y, z] if self.sign[0] > 0 else [-z, -y, x, w]
+        if self.sign[0] > 0:
+            return [w, x, y, z]
+        return [w, -x, -y, z] if self.is_shared else [-z, -y, x, w]
+
+    def lever(self, wxyz):
+        """The arm's point of its object relative to the object's centre, from the object's orientation."""
+        lever = np.zeros(3)
+        mujoco.mju_rotVecQuat(lever, self.object_point, wxyz)
+        return lever
 
 
 def in_reach(reach, at):
@@ -221,8 +236,9 @@ class MujocoWorld:
             if arm.tilts:
                 self.turn_bodies(arm)
             at = arm.object_qpos
-            self.data.qpos[at : at + 3] = arm.world_from_arm(numbers_of_arm[3:6])
-            self.data.qpos[at + 3 : at + 7] = arm.orientation_in_world(numbers_of_arm[12:16])
+            quaternion = np.array(arm.orientation_in_world(numbers_of_arm[12:16]))
+            self.data.qpos[at : at + 3] = arm.world_from_arm(numbers_of_arm[3:6]) - arm.lever(quaternion)
+            self.data.qpos[at + 3 : at + 7] = quaternion
             arm.kinematics.start(arm.arm_from_world(palm))
         self.damper = None
         if len(self.arms) == 2:
@@ -237,9 +253,10 @@ class MujocoWorld:
         for arm in self.arms:
             palm, palm_velocity = self.position(arm.palm), self.velocity(arm.palm)
             at, start = arm.object_qpos, arm.object
-            thing, quaternion = self.data.qpos[at : at + 3], self.data.qpos[at + 3 : at + 7]
-            spin = np.zeros(3)
+            quaternion, spin = self.data.qpos[at + 3 : at + 7], np.zeros(3)
             mujoco.mju_rotVecQuat(spin, self.data.qvel[start + 3 : start + 6], quaternion)
+            lever = arm.lever(quaternion)
+            thing, thing_velocity = self.data.qpos[at : at + 3] + lever, self.velocity(start) + cross(spin, lever)
             openings, rates = self.openings(arm)
             rows += [
                 arm.arm_from_world(palm),
@@ -247,7 +264,7 @@ class MujocoWorld:
                 arm.sign * (thing - palm),
                 openings,
                 arm.orientation_in_arm(quaternion),
-                arm.sign * (self.velocity(start) - palm_velocity) * per_step,
+                arm.sign * (thing_velocity - palm_velocity) * per_step,
                 arm.sign * spin * per_step,
                 arm.sign * palm_velocity * per_step,
                 rates * per_step,

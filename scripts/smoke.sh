@@ -82,16 +82,17 @@ for file in policies/*.safetensors; do
 done
 for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
 
-echo '- policies of both worlds push in another physics engine'
+echo '- policies push and carry a bar in another physics engine'
 "$work/venv/bin/pip" install --quiet --requirement scripts/requirements-mujoco.txt
 "$work/venv/bin/python" scripts/mujoco_transfer.py policies/teacher-push.safetensors \
-  policies/teacher-push-classic.safetensors --episodes 4 --json >"$work/transfer.json"
+  policies/teacher-push-classic.safetensors policies/student-carry-bar.safetensors --episodes 4 --json \
+  >"$work/transfer.json"
 python3 - "$work/transfer.json" <<'PY'
 import json, sys
 results = json.load(open(sys.argv[1]))
-assert len(results) == 2, results
+assert len(results) == 3, results
 for result in results:
-    assert result["rapier"]["success"] == 1.0 and result["mujoco"]["success"] >= 0.75, result
+    assert result["rapier"]["success"] >= 0.75 and result["mujoco"]["success"] >= 0.75, result
 PY
 
 echo '- a client that knows nothing of it talks to a teacher'
