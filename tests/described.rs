@@ -258,7 +258,8 @@ fn an_evaluation_on_a_server_gives_the_results_of_the_run() {
     let difference = "tolerance is 0.25 in the policy and 0.5 for one arm of the server's task";
     let refused = eval(&["--composed-teachers", text(&teacher), "--env", &two.address]);
     check_refused(&refused, 64, difference);
-    check_refused(&eval(&["--policy", text(&student)]), 64, "tandem eval --env ADDR");
+    let command = format!("`tandem eval --policy {} --env 127.0.0.1:", text(&student));
+    check_refused(&eval(&["--policy", text(&student)]), 64, &command);
     let refused = run(&["scene", "--policy", text(&student)]);
     check_refused(&refused, 64, "which the simulator does not have");
     let refused = eval(&["--policy", text(&student), "--env", &two.address, "--arms", "1"]);
