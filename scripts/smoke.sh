@@ -91,8 +91,8 @@ python3 - "$work/transfer.json" <<'PY'
 import json, sys
 results = json.load(open(sys.argv[1]))
 assert len(results) == 3, results
-for result in results:
-    assert result["rapier"]["success"] >= 0.75 and result["mujoco"]["success"] >= 0.75, result
+for result, least in zip(results, [1.0, 1.0, 0.75]):
+    assert result["rapier"]["success"] >= least and result["mujoco"]["success"] >= 0.75, result
 PY
 
 echo '- a client that knows nothing of it talks to a teacher'

@@ -9,10 +9,9 @@ use serde::{Deserialize, Serialize};
 use tandem_system::atomic_file;
 
 use crate::cli::{EnvironmentArgs, TrainArgs};
-use crate::environment_server::names_server;
+use crate::environment_server::{names_server, shell_words};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::input;
-use crate::shell::shell_text;
 
 /// The options of the server, by their names on the command line.
 #[derive(Debug, Default, Deserialize, Serialize)]
@@ -63,11 +62,10 @@ pub(crate) fn keep(args: &EnvironmentArgs, out: &Path) -> Result<(), Failed> {
     atomic_file::replace(&path, text.as_bytes()).or_cannot_write(what)
 }
 
-/// Returns the option with the server of the run in `out`, as a shell takes it, if the run remembers one.
-pub(crate) fn server_option(out: &Path) -> Option<String> {
+/// Returns the options of the server of the run in `out`, as a shell takes them, if the run remembers one.
+pub(crate) fn server_options(out: &Path) -> Option<String> {
     let args = read(&path_in(out)).ok()?;
-    let command = args.env_command.map(|command| format!("--env-command {}", shell_text(command)));
-    command.or_else(|| Some(format!("--env {}", shell_text(args.env?))))
+    names_server(&args).then(|| shell_words(&args))
 }
 
 fn path_in(out: &Path) -> PathBuf {
@@ -124,10 +122,16 @@ mod tests {
         for args in [command, address] {
             keep(&args, out.path()).expect("writes");
             assert_eq!(read(&path).expect("complete"), args);
-            let option = server_option(out.path()).expect("a server");
+            let options = server_options(out.path()).expect("a server");
             assert!(match args.env_command {
-                Some(_) => option == r#"--env-command 'serve --name "it'\''s" | tee log'"#,
-                None => option == "--env https://lab:7005",
+                Some(_) => {
+                    let command = r#"--env-command 'serve --name "it'\''s" | tee log'"#;
+                    options == format!("{command} --env-timeout-s 1.5")
+                }
+                None => {
+                    let files = "--env-token-file /run/token --env-tls-ca /run/ca.pem";
+                    options == format!("--env https://lab:7005 {files}")
+                }
             });
         }
         let none = EnvironmentArgs::default();

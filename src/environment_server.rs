@@ -11,6 +11,7 @@ use crate::access;
 use crate::cli::{ClientArgs, EnvironmentArgs, SecretArgs};
 use crate::environment_command::CommandServer;
 use crate::exit::Failed;
+use crate::shell::shell_text;
 
 /// The environments in which a worker plays.
 pub(crate) enum EnvironmentSource {
@@ -88,6 +89,13 @@ pub(crate) fn arguments(args: &EnvironmentArgs) -> Vec<OsString> {
     let timeout_s = env_timeout_s.filter(|_| names_server(args));
     push("--env-timeout-s", timeout_s.map(seconds_text));
     options
+}
+
+/// Returns the options for a shell.
+pub(crate) fn shell_words(args: &EnvironmentArgs) -> String {
+    let words = arguments(args).into_iter();
+    let words = words.map(|word| shell_text(word.to_string_lossy().into_owned()));
+    words.collect::<Vec<_>>().join(" ")
 }
 
 /// Returns whether the options name a server.

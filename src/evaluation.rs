@@ -16,7 +16,7 @@ use tandem_worker::{
     Perturbation, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
 };
 
-use crate::environment_file::server_option;
+use crate::environment_file::server_options;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::shell::shell_word;
 use crate::{clock, output};
@@ -145,8 +145,8 @@ fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
 /// Returns the command that evaluates the policy of a task of a server, with the server of its run if that is known.
 fn evaluation_command(path: &Path) -> String {
     let run = if path.is_dir() { Some(path) } else { path.parent().and_then(Path::parent) };
-    match run.and_then(server_option) {
-        Some(option) => format!("`tandem eval --policy {} {option}`", shell_word(path)),
+    match run.and_then(server_options) {
+        Some(options) => format!("`tandem eval --policy {} {options}`", shell_word(path)),
         None => "`tandem eval --env ADDR` or `--env-command CMD`".to_owned(),
     }
 }

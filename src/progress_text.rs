@@ -140,8 +140,8 @@ pub(crate) fn grouped(number: u64) -> String {
 pub(crate) fn failures_text(progress: &pb::Progress) -> Option<String> {
     match progress.environment_failures {
         0 => None,
-        1 => Some("failed once, tandem.log has the cause".to_owned()),
-        n => Some(format!("failed {} times, tandem.log has the causes", grouped(n))),
+        1 => Some("failed once, the log of the worker has the cause".to_owned()),
+        n => Some(format!("failed {} times, the log of the workers has the causes", grouped(n))),
     }
 }
 
@@ -238,8 +238,11 @@ mod tests {
             failures_text(&pb::Progress { environment_failures, ..Default::default() })
         };
         assert_eq!(of(0), None);
-        assert_eq!(of(1).as_deref(), Some("failed once, tandem.log has the cause"));
-        assert_eq!(of(1_300).as_deref(), Some("failed 1,300 times, tandem.log has the causes"));
+        assert_eq!(of(1).as_deref(), Some("failed once, the log of the worker has the cause"));
+        assert_eq!(
+            of(1_300).as_deref(),
+            Some("failed 1,300 times, the log of the workers has the causes")
+        );
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use serde_json::Value;
-use tandem_system::DirectoryLock;
+use tandem_system::{DirectoryLock, regular_file};
 
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::run_file;
@@ -66,18 +66,22 @@ impl Display for RunState {
     }
 }
 
+/// Returns the summary that `tandem train` has written for the run in `out`, if there is one.
+pub(crate) fn summary(out: &Path) -> Option<Value> {
+    let bytes = regular_file::read(&out.join("summary.json")).ok()?;
+    serde_json::from_slice(&bytes).ok().filter(Value::is_object)
+}
+
 /// Returns how far the run in `out` is.
 pub(crate) fn state(out: &Path) -> RunState {
     let limit = run_file::resolve(Some(&out.join("run.toml")), &[])
         .map(|run| (run.stop.max_env_steps, run.env_steps_per_round()));
-    // A run that is resumed for longer has the summary of the shorter one until its end.
+    // The learner of a run that was extended without `tandem train` leaves the summary of the shorter one.
     let is_of_length = |summary: &Value| {
         let of_run = summary.get("max_env_steps").and_then(Value::as_u64);
         of_run.is_none_or(|of_run| limit.as_ref().is_ok_and(|(limit, _)| *limit == of_run))
     };
-    let summary = std::fs::read(out.join("summary.json")).ok();
-    let summary = summary.and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    if summary.is_some_and(|summary: Value| summary.is_object() && is_of_length(&summary)) {
+    if summary(out).is_some_and(|summary| is_of_length(&summary)) {
         return RunState::Complete;
     }
     match (saved_round(out), limit) {
@@ -117,8 +121,8 @@ pub(crate) fn runs_in(parent: &Path) -> Vec<PathBuf> {
     runs
 }
 
-/// Returns the directories in `parent` that hold the runs of a sweep, with the states of these.
-pub(crate) fn sweeps_in(parent: &Path) -> Vec<(PathBuf, Vec<RunState>)> {
+/// Returns the directories in `parent` that hold runs, as that of a sweep does, with the states of these.
+pub(crate) fn parents_in(parent: &Path) -> Vec<(PathBuf, Vec<RunState>)> {
     let entries = std::fs::read_dir(parent).into_iter().flatten();
     let directories = entries.filter_map(|entry| Some(entry.ok()?.path()));
     let directories = directories.filter(|directory| !directory.join("run.toml").exists());
@@ -126,9 +130,9 @@ pub(crate) fn sweeps_in(parent: &Path) -> Vec<(PathBuf, Vec<RunState>)> {
         let states = runs_in(&directory).iter().map(|run| state(run)).collect::<Vec<_>>();
         (directory, states)
     });
-    let mut sweeps: Vec<_> = states.filter(|(_, states)| !states.is_empty()).collect();
-    sweeps.sort_by(|(a, _), (b, _)| a.cmp(b));
-    sweeps
+    let mut parents: Vec<_> = states.filter(|(_, states)| !states.is_empty()).collect();
+    parents.sort_by(|(a, _), (b, _)| a.cmp(b));
+    parents
 }
 
 /// Locks a directory; `None` if another process has locked it.

@@ -24,6 +24,8 @@ use crate::{access, call_failure, output, run_directory, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// What to do if a run has no learner at the moment.
+const STARTING_OR_ENDING: &str = "its run is starting or ending: try again";
 /// Seconds of run time after which a line is printed even without news.
 const LINE_EVERY_S: f64 = 30.0;
 
@@ -32,6 +34,10 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let address = match source_of(&args.run)? {
         Source::Learner(address) => address,
         Source::Recorded => return recorded::show(&args.run, args.json),
+        Source::List if args.watch => {
+            let shown = args.run.display();
+            return Err(Failed::usage(format!("--watch: {shown} holds several runs: name one")));
+        }
         Source::List => return recorded::list(&args.run, args.json),
     };
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
@@ -41,7 +47,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
         let mut learner = Learner {
             client: LearnerClient::new(link),
             advice: match args.run.is_dir() {
-                true => "its run is starting or ending: try again",
+                true => STARTING_OR_ENDING,
                 false => "`tandem status DIR` shows a `tandem train` by its run directory",
             },
             address,
@@ -75,18 +81,21 @@ fn source_of(run: &Path) -> Result<Source, Failed> {
     }
     if !run.join("run.toml").exists() {
         let has_runs =
-            !run_directory::runs_in(run).is_empty() || !run_directory::sweeps_in(run).is_empty();
+            !run_directory::runs_in(run).is_empty() || !run_directory::parents_in(run).is_empty();
         let none = || run_directory::no_run(&format!("{} holds no run", run.display()));
         return if has_runs { Ok(Source::List) } else { Err(none()) };
     }
-    let Ok(address) = std::fs::read_to_string(run_directory::learner_address(run)) else {
-        return Ok(Source::Recorded);
-    };
     // A `tandem train` that was killed has left the address, at which another program may listen now.
-    Ok(match run_directory::lock(run)? {
-        Some(_is_unused) => Source::Recorded,
-        None => Source::Learner(address.trim().to_owned()),
-    })
+    if run_directory::lock(run)?.is_some() {
+        return Ok(Source::Recorded);
+    }
+    match std::fs::read_to_string(run_directory::learner_address(run)) {
+        Ok(address) => Ok(Source::Learner(address.trim().to_owned())),
+        Err(_missing) => Err(Failed::new(
+            Exit::TryAgain,
+            anyhow!("a process uses {}: {STARTING_OR_ENDING}", run.display()),
+        )),
+    }
 }
 
 /// Prints the current progress.

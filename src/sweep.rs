@@ -28,7 +28,6 @@ use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::cli::{EnvironmentArgs, SweepArgs};
-use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::shell::shell_word;
 use crate::{dashboard, output, runtime, signals};
@@ -393,17 +392,13 @@ fn print_plan(
 
 /// Returns a note if runs are of the classic world, whose tasks have the names that `tandem train --task` has for those of
 /// its default world.
-fn classic_note(statuses: &[RunStatus]) -> Option<String> {
+fn classic_note(statuses: &[RunStatus]) -> Option<&'static str> {
     let mut tasks =
         statuses.iter().filter_map(|status| status.run.config.task.parse::<Task>().ok());
-    let task = tasks.find(|task| task.world() == World::Classic)?;
-    let name = task.name();
-    Some(wrapped(
-        &format!(
-            "{name} is in the classic world; in the default world of `tandem train` it is shared-{name}"
-        ),
-        "  ",
-    ))
+    tasks.any(|task| task.world() == World::Classic).then_some(
+        "push and pick-and-place are in the classic world here; shared-push and\n  \
+         shared-pick-and-place are the tasks of `tandem train`'s default world",
+    )
 }
 
 fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {

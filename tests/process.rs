@@ -1,7 +1,7 @@
 //! Whole runs from the command line, with signals sent to their processes.
 
 use std::fs;
-use std::io::{Read as _, Write as _};
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -195,19 +195,28 @@ fn an_interrupted_run_resumes_to_the_same_result() {
     let (code, listed, _) = status(out.parent().expect("a parent"));
     assert_eq!(code, Some(0));
     assert!(listed.contains("run  complete  ") && listed.contains("success"), "{listed}");
+    let _lock = tandem_system::DirectoryLock::try_take(&out).expect("a directory").expect("free");
+    let (code, shown, message) = status(&out);
+    assert_eq!((code, shown.as_str()), (Some(75), ""), "{message}");
+    assert!(message.contains("its run is starting or ending: try again"), "{message}");
 }
 
 #[test]
 fn a_run_that_is_signalled_twice_at_once_is_saved() {
     let (_keep, out) = run_directory();
-    let run = start_with("1", LONG, &["--set", "checkpoint.every_rounds=1000"], &out);
+    let mut run = start_with("1", LONG, &["--set", "checkpoint.every_rounds=1000"], &out);
     let n_evaluations =
         || fs::read_to_string(out.join("metrics.jsonl")).map(|text| text.lines().count());
     assert!(eventually(|| n_evaluations().is_ok_and(|n| n >= 2)));
     assert!(checkpoints(&out).is_empty());
     signal("-INT", run.id());
-    std::thread::sleep(Duration::from_millis(5));
+    let mut messages = BufReader::new(run.stderr.take().expect("piped")).lines();
+    let is_interrupted = |line: std::io::Result<String>| {
+        line.is_ok_and(|line| line.starts_with("interrupted: saving"))
+    };
+    assert!(messages.any(is_interrupted));
     signal("-INT", run.id());
+    drop(std::thread::spawn(move || messages.for_each(drop)));
     let interrupted = finish(run);
     assert_eq!(interrupted.status.code(), Some(130), "{}", stderr(&interrupted));
     assert_eq!(checkpoints(&out).len(), 1, "{}", stderr(&interrupted));
@@ -394,7 +403,7 @@ fn services_print_their_address_and_end_on_sigterm() {
         .spawn()
         .expect("starts");
     let mut line = String::new();
-    let mut output = std::io::BufReader::new(teacher.stdout.take().expect("piped"));
+    let mut output = BufReader::new(teacher.stdout.take().expect("piped"));
     std::io::BufRead::read_line(&mut output, &mut line).expect("a line");
     let address = line.trim().strip_prefix("listening on ").expect("the line").to_owned();
     assert!(TcpStream::connect(&address).is_ok(), "{address}");

@@ -377,8 +377,10 @@ impl LearnerService {
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
-        self.shared.lock().queue.submit(worker_id, slot, episodes, now).map_err(refused)?;
-        if let Some(check) = environment_check {
+        let is_new = self.shared.lock().queue.submit(worker_id, slot, episodes, now);
+        if is_new.map_err(refused)?
+            && let Some(check) = environment_check
+        {
             self.shared.record_environment_check(&check);
         }
         self.shared.arrived.notify_one();

@@ -84,5 +84,9 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    lazy = (name for names in _SERVICES.values() for name in names)
+    import importlib.util
+
+    # Tools read the value of each name.
+    has_grpc = importlib.util.find_spec("grpc") is not None
+    lazy = (name for names in _SERVICES.values() for name in names if has_grpc)
     return sorted({*globals(), "__version__", *lazy} - {"Any", "TYPE_CHECKING"})

@@ -322,15 +322,14 @@ def _checked_norm(
 def _sparse_reward(
     compute_reward: Any, achieved: NDArray[Any], desired: NDArray[Any], info: dict[str, Any]
 ) -> float:
-    """Returns the reward as -1 or 0, also of an environment whose rewards are 0 and 1."""
+    """Returns the reward less that at the goal, -1 or 0: the rewards of an environment are -1 and 0, or 0 and 1."""
     reward, at_goal = (float(compute_reward(achieved, goal, info)) for goal in (desired, achieved.copy()))
-    sparse = reward - 1.0 if at_goal == 1.0 else reward
-    if sparse not in (-1.0, 0.0):
+    if at_goal not in (0.0, 1.0) or reward - at_goal not in (-1.0, 0.0):
         raise ServiceError(
-            f"the reward is not sparse: compute_reward returned {reward:g}, expected -1 or 0, or 0 or 1 "
-            "(many environments take reward_type=\"sparse\")"
+            f"the reward is not sparse: compute_reward returned {reward:g}, and {at_goal:g} at the goal, expected -1 "
+            "and 0, or 0 and 1 (many environments take reward_type=\"sparse\")"
         )
-    return sparse
+    return reward - at_goal
 
 
 def _goal_pairs(
@@ -356,9 +355,10 @@ def _disagreement(
         apart = distance(norm, achieved, desired)
         expected = 0.0 if apart <= tolerance else -1.0
         if reward != expected and abs(apart - tolerance) > 1e-3 * tolerance:
+            said, is_at = ("achieved", "beyond") if reward == 0.0 else ("not achieved", "within")
             return (
-                f"compute_reward returned {reward:g} at {norm} distance {apart:.4g}, expected {expected:g} with "
-                f"tolerance {tolerance:g}: give the environment's own tolerance and norm"
+                f"by compute_reward a goal at {norm} distance {apart:.4g} is {said}, {is_at} the tolerance "
+                f"{tolerance:g}: give the environment's own tolerance and norm"
             )
     return None
 

@@ -141,6 +141,8 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Episode]:
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist: name a log, a directory of logs or a run directory")
         return _Episodes([path], is_directory=False)
+    with os.scandir(path):
+        pass  # An unreadable directory is an error. Others below it are left out if they disappear.
     logs = list(_logs_below(path))
     if not logs:
         record = "record episodes by `tandem eval --record-dir DIR` or `tandem train --record all`"
@@ -150,8 +152,11 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Episode]:
 
 def _logs_below(directory: str | os.PathLike[str]) -> Iterator[Path]:
     """Returns the logs in and below a directory in the order of their names."""
-    with os.scandir(directory) as entries:
-        ordered = sorted(entries, key=lambda entry: entry.name)
+    try:
+        with os.scandir(directory) as entries:
+            ordered = sorted(entries, key=lambda entry: entry.name)
+    except FileNotFoundError:
+        return
     for entry in ordered:
         if entry.is_dir(follow_symlinks=False):
             yield from _logs_below(entry.path)

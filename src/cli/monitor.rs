@@ -39,7 +39,7 @@ pub(crate) struct HealthArgs {
 Examples:
   tandem status runs/mine          # of a running `tandem train`
   tandem status runs/mine --watch
-  tandem status runs               # lists the runs and sweeps in a directory
+  tandem status runs               # lists the runs in a directory
   tandem status 127.0.0.1:7000
   tandem status learner:7000 --token-file token --watch
   tandem status learner:7000 --token-file token --json

@@ -1,20 +1,23 @@
 //! Numbers on the command line.
 
-/// Parses a whole number, also with `_` between its digits or with an exponent: 100000, `100_000` or 1e5.
+/// Parses a whole number, also with `_` between its digits or with an exponent: 100000, `100_000`, 1e5 or 1.5e6.
 pub(super) fn whole(text: &str) -> Result<u64, String> {
-    let wrong = || "expected a whole number, such as 100000, 100_000 or 1e5".to_owned();
-    let has_digits = text.starts_with(|c: char| c.is_ascii_digit()) && !text.ends_with('_');
-    let digits = if has_digits { text.replace('_', "") } else { return Err(wrong()) };
-    let (mantissa, exponent) = match digits.split_once(['e', 'E']) {
-        Some((mantissa, exponent)) => (mantissa, exponent.parse().map_err(|_invalid| wrong())?),
-        None => (digits.as_str(), 0),
-    };
-    let (whole, fraction) = mantissa.split_once('.').unwrap_or((mantissa, ""));
-    let n_zeros: u32 = exponent;
-    let n_zeros = n_zeros.checked_sub(u32::try_from(fraction.len()).map_err(|_long| wrong())?);
-    let number: u64 = format!("{whole}{fraction}").parse().map_err(|_invalid| wrong())?;
-    let scale = n_zeros.and_then(|n_zeros| 10_u64.checked_pow(n_zeros));
-    scale.and_then(|scale| number.checked_mul(scale)).ok_or_else(wrong)
+    parse(text).ok_or_else(|| {
+        "expected a whole number below 2^64, such as 100000, 100_000 or 1e5".to_owned()
+    })
+}
+
+fn parse(text: &str) -> Option<u64> {
+    let is_number = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit());
+    let (mantissa, exponent) = text.split_once(['e', 'E']).unwrap_or((text, "0"));
+    let (whole, fraction) = mantissa.split_once('.').unwrap_or((mantissa, "0"));
+    if !whole.split('_').chain([fraction, exponent]).all(is_number) {
+        return None;
+    }
+    let fraction = fraction.trim_end_matches('0');
+    let number: u64 = format!("{}{fraction}", whole.replace('_', "")).parse().ok()?;
+    let n_zeros = exponent.parse::<u32>().ok()?.checked_sub(u32::try_from(fraction.len()).ok()?)?;
+    number.checked_mul(10_u64.checked_pow(n_zeros)?)
 }
 
 #[cfg(test)]
@@ -29,13 +32,17 @@ mod tests {
             ("100_000", 100_000),
             ("1e5", 100_000),
             ("1.5E6", 1_500_000),
+            ("1.50e1", 15),
+            ("1.0", 1),
             ("18446744073709551615", u64::MAX),
         ] {
             assert_eq!(whole(text), Ok(number), "{text}");
         }
-        for text in
-            ["", "-1", "+1", "_1", "1_", "1.5", "1e-3", "1e", "1e99", "nan", "1,000", "0x10"]
-        {
+        let not_whole =
+            ["", "-1", "+1", "1.5", "1.", ".5", "1e-3", "1e", "1e+3", "nan", "1,000", "0x10"];
+        let underscores = ["_1", "1_", "1__0", "1_e5"];
+        let too_large = ["1e20", "1e99", "18446744073709551616"];
+        for text in not_whole.iter().chain(&underscores).chain(&too_large) {
             assert!(whole(text).is_err(), "{text}");
         }
     }

@@ -1,4 +1,4 @@
-//! The names that other trainers give to settings. docs/recipes.md has the same table.
+//! The names that other trainers give to settings. docs/recipes.md has the usual ones.
 
 /// Names of other trainers, each with the settings that have that meaning here.
 const OTHER_NAMES: [(&[&str], &str); 16] = [

@@ -25,7 +25,9 @@ pub(super) fn show(dir: &Path, prints_json: bool) -> Result<(), Failed> {
     let state = run_directory::state(dir);
     let progress = progress_of(dir, state)?;
     if prints_json {
-        output::print(progress_json(&progress))?;
+        let mut shown = progress_json(&progress);
+        shown["state"] = state.to_string().into();
+        output::print(shown)?;
     } else if progress.evaluation.is_some() {
         lines(&progress).iter().try_for_each(output::print)?;
     }
@@ -34,19 +36,19 @@ pub(super) fn show(dir: &Path, prints_json: bool) -> Result<(), Failed> {
     }
     let (shown, word) = (dir.display(), shell_word(dir));
     let what = anyhow!(
-        "no learner of a `tandem train` is running in {shown} ({state}); `tandem train --resume --out {word}` resumes it"
+        "no learner of a `tandem train` is running in {shown} ({state}); `tandem train --resume --out {word}` continues it"
     );
     Err(Failed::new(Exit::TryAgain, what))
 }
 
-/// Prints a line for each run in `parent`, and one for each sweep.
+/// Prints a line for each run in `parent`, and one for each directory in it that holds runs.
 pub(super) fn list(parent: &Path, prints_json: bool) -> Result<(), Failed> {
     let runs: Vec<Listed> = run_directory::runs_in(parent).into_iter().map(Listed::read).collect();
-    let sweeps = run_directory::sweeps_in(parent);
+    let directories = run_directory::parents_in(parent);
     if prints_json {
-        let sweeps: Vec<Value> = sweeps.iter().map(sweep_json).collect();
+        let directories: Vec<Value> = directories.iter().map(parent_json).collect();
         let runs: Vec<Value> = runs.iter().map(Listed::json).collect();
-        return output::print(json!({"runs": runs, "sweeps": sweeps}));
+        return output::print(json!({"runs": runs, "directories": directories}));
     }
     let width = |texts: &mut dyn Iterator<Item = usize>| texts.max().unwrap_or(0);
     let name_width = width(&mut runs.iter().map(|run| run.path.display().to_string().len()));
@@ -56,16 +58,19 @@ pub(super) fn list(parent: &Path, prints_json: bool) -> Result<(), Failed> {
         let line = format!("{path:name_width$}  {state:state_width$}  {result}");
         output::print(line.trim_end())?;
     }
-    for (path, states) in &sweeps {
-        let n_complete = states.iter().filter(|state| **state == RunState::Complete).count();
-        let (shown, n) = (path.display(), states.len());
-        output::print(format_args!("{shown}: a sweep, {n_complete} of {n} runs complete"))?;
+    for (path, states) in &directories {
+        let (shown, n_complete, n) = (path.display(), n_complete(states), states.len());
+        output::print(format_args!("{shown}: {n_complete} of {n} runs complete"))?;
     }
     Ok(())
 }
 
-fn sweep_json((path, states): &(PathBuf, Vec<RunState>)) -> Value {
-    let n_complete = states.iter().filter(|state| **state == RunState::Complete).count();
+fn n_complete(states: &[RunState]) -> usize {
+    states.iter().filter(|state| **state == RunState::Complete).count()
+}
+
+fn parent_json((path, states): &(PathBuf, Vec<RunState>)) -> Value {
+    let n_complete = n_complete(states);
     json!({"directory": path.to_string_lossy(), "n_runs": states.len(), "n_complete": n_complete})
 }
 
@@ -106,7 +111,7 @@ impl Listed {
     }
 }
 
-/// Returns the progress of a run at its last evaluation.
+/// Returns the progress of a run at its last evaluation. What only a summary has is missing before the run is complete.
 fn progress_of(dir: &Path, state: RunState) -> Result<pb::Progress, Failed> {
     let config = run_file::resolve(Some(&dir.join("run.toml")), &[])?;
     let mut warnings = Vec::new();
@@ -122,11 +127,17 @@ fn progress_of(dir: &Path, state: RunState) -> Result<pb::Progress, Failed> {
         best: run.best().map(encode_evaluation),
         evaluation: run.last().map(encode_evaluation),
         ended: state == RunState::Complete,
-        end_reason: state.to_string(),
         max_env_steps: config.stop.max_env_steps,
         max_minutes: config.stop.max_minutes,
         ..Default::default()
     };
+    if progress.ended {
+        let summary = run_directory::summary(dir).unwrap_or_default();
+        let text = |key: &str| summary[key].as_str().unwrap_or_default().to_owned();
+        (progress.digest, progress.environment) = (text("digest"), text("environment"));
+        progress.environment_failures = summary["environment_failures"].as_u64().unwrap_or(0);
+        progress.end_reason = state.to_string();
+    }
     if let Some(last) = run.last() {
         progress.round = last.round;
         progress.env_steps = last.env_steps;

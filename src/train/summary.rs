@@ -10,14 +10,14 @@ use tandem_system::atomic_file;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
-use crate::cli::{EnvironmentArgs, TrainArgs, task_flags};
+use crate::cli::{TrainArgs, task_flags};
 use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::progress_text::{advice_text, clock_text, failures_text, grouped};
 use crate::run_pages::RunPages;
-use crate::shell::{shell_text, shell_word};
+use crate::shell::shell_word;
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
 
 /// File in the run directory.
@@ -164,7 +164,7 @@ fn next_commands(plan: &Plan) -> Vec<(String, Option<String>)> {
     let evaluate = format!("tandem eval --policy {policy}");
     let mut commands = vec![match is_simulated {
         true => (evaluate, (plan.config.arms == 2).then(|| "--baselines".to_owned())),
-        false => (evaluate, Some(server_options(&plan.environment))),
+        false => (evaluate, Some(environment_server::shell_words(&plan.environment))),
     }];
     if plan.config.arms == 1 && is_simulated {
         let task = plan.config.task.parse().map_or_else(|_unknown| String::new(), task_flags);
@@ -183,13 +183,6 @@ fn next_commands(plan: &Plan) -> Vec<(String, Option<String>)> {
         ));
     }
     commands
-}
-
-/// Returns the options of a server of environments for a shell.
-fn server_options(environment: &EnvironmentArgs) -> String {
-    let words = environment_server::arguments(environment);
-    let words = words.into_iter().map(|word| shell_text(word.to_string_lossy().into_owned()));
-    words.collect::<Vec<_>>().join(" ")
 }
 
 /// Indents a command, and puts its last option on a second line if it is too long for a terminal.
@@ -264,13 +257,14 @@ fn summary_json(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::EnvironmentArgs;
 
     #[test]
     fn a_command_for_served_environments_names_the_server_and_is_not_broken_within_a_word() {
         let command = "python -m tandem.serve FetchPush-v4 --seed 1 --reward sparse".to_owned();
         let environment =
             EnvironmentArgs { env_command: Some(command), ..EnvironmentArgs::default() };
-        let option = server_options(&environment);
+        let option = environment_server::shell_words(&environment);
         let line = command_line(&("tandem eval --policy p".to_owned(), Some(option)));
         assert_eq!(
             line,
@@ -282,7 +276,7 @@ mod tests {
             env_token_file: Some("a token".into()),
             ..EnvironmentArgs::default()
         };
-        let option = server_options(&environment);
+        let option = environment_server::shell_words(&environment);
         assert_eq!(option, "--env 127.0.0.1:7005 --env-token-file 'a token'");
         let short = command_line(&("tandem eval".to_owned(), Some(option)));
         assert_eq!(short, "  tandem eval --env 127.0.0.1:7005 --env-token-file 'a token'");

@@ -33,7 +33,7 @@ pub enum Error {
     },
     /// An actor is given in place of its critic.
     #[error(
-        "{path:?} is not a critic but an actor: it takes no action and returns {n_outputs} numbers"
+        "{path:?} is not a critic: it takes no action, as an actor does, and returns {n_outputs} numbers"
     )]
     NotACritic {
         /// The file.

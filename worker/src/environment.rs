@@ -211,9 +211,13 @@ impl Environments {
             Failure::Final(error) => return Err(*error),
         };
         self.n_failures += 1;
-        self.unreported.n += 1;
-        let cause = shortened(&status.message().replace(char::is_control, " "), MAX_CAUSE_CHARS);
-        self.unreported.latest = format!("{}: {cause}", self.name);
+        // Further attempts belong to the same failure, such as a server that is away.
+        if self.n_failures == 1 {
+            self.unreported.n += 1;
+            let message = status.message().replace(char::is_control, " ");
+            let cause = shortened(&message, MAX_CAUSE_CHARS);
+            self.unreported.latest = format!("{}: {cause}", self.name);
+        }
         if self.n_failures >= self.config.max_attempts {
             let (server, n_failures) = (self.name.clone(), self.n_failures);
             return Err(Error::EnvironmentFailed { server, n_failures, status });

@@ -195,7 +195,7 @@ mod tests {
         assert_eq!(
             refusal(&shared, Some(&shared)),
             format!(
-                "{shared:?} is not a critic but an actor: it takes no action and returns 3 numbers"
+                "{shared:?} is not a critic: it takes no action, as an actor does, and returns 3 numbers"
             )
         );
         let mut policy = Policy::load(&policy_file("teacher-push.safetensors")).unwrap();
