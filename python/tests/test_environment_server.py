@@ -288,8 +288,8 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
     ("kwargs", "options", "message"),
     [
         ({"dense": True}, {}, "the reward is not sparse"),
-        ({}, {"tolerance": 0.3}, r"a goal at euclidean distance 0\.2\d+ is not achieved, within"),
-        ({}, {"norm": "maximum"}, r"a goal at maximum distance [\d.]+ is not achieved, within"),
+        ({}, {"tolerance": 0.3}, "a goal at euclidean distance 0.2"),
+        ({}, {"norm": "maximum"}, "a goal at maximum distance"),
         ({}, {"tolerance": -1.0}, "the tolerance must be a positive number"),
         ({}, {"bound": 0.0}, "the bound must be a positive number, not 0.0"),
         ({}, {"bound": float("nan")}, "the bound must be a positive number, not nan"),
@@ -500,7 +500,8 @@ def test_another_reward_is_refused_before_its_tolerance_is_measured(reward: Any,
 def test_rewards_of_1_within_the_tolerance_and_0_beyond_it_are_sparse_too() -> None:
     env = with_reward(lambda apart: float(apart <= 0.25))
     assert describe(env, TaskOptions(episode_steps=5))[0].tolerance == 0.25
-    with pytest.raises(tandem.ServiceError, match=r"a goal at euclidean distance 0\.\d+ is not achieved, within the tolerance 0.3"):
+    expected = r"a goal at euclidean distance 0\.\d+ is not achieved, within the tolerance 0.3"
+    with pytest.raises(tandem.ServiceError, match=expected):
         describe(env, TaskOptions(episode_steps=5, tolerance=0.3))
 
 
