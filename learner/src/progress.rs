@@ -59,7 +59,7 @@ pub(crate) struct EnvironmentChecks {
     pub(crate) n_episodes: u64,
     /// True if one of them differed the second time.
     pub(crate) differs: bool,
-    /// Failed attempts to play since the learner started.
+    /// Failures of servers since the learner started, as workers have reported them.
     pub(crate) n_failures: u64,
 }
 

@@ -41,7 +41,7 @@ pub(crate) struct PlayedSlot {
     pub(crate) failures: Failures,
 }
 
-/// Failed attempts to play on a server.
+/// Failures of a server; attempts that follow a failure before a slot is played belong to it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Failures {
     /// Their number.
