@@ -13,7 +13,7 @@ use super::{RecordingArgs, TaskName, WorldName};
 /// Access token.
 #[derive(Debug, Args)]
 pub(crate) struct SecretArgs {
-    /// File with the access token of the run's services; required to listen on non-loopback addresses.
+    /// File with the access token of the run's services. A service on a non-loopback address requires one.
     #[arg(long, value_name = "FILE", env = "TANDEM_TOKEN_FILE")]
     pub(crate) token_file: Option<PathBuf>,
 }
