@@ -52,8 +52,8 @@ pub(crate) struct TrialArgs {
     /// Fraction of the highest speed, 0.01 to 1.
     #[arg(long, default_value_t = 1.0)]
     pub(crate) speed: f64,
-    /// Edge of the blocks in cm; 4.5 in training, 9 in the paper's trials. An object that both arms share keeps its size
-    /// [default: 5.6].
+    /// Edge of the blocks in cm; 4.5 to 6.5 in the training of students of the shared world, 4.5 in that of the classic
+    /// world, 9 in the paper's trials. An object that both arms share keeps its size [default: 5.6].
     #[arg(long)]
     pub(crate) block_cm: Option<f32>,
     /// Coulomb friction of the grippers' pads, 0 to 2. Blocks have 0.5, and a contact has the larger of both.
@@ -77,7 +77,7 @@ pub(crate) struct TrialArgs {
 pub(crate) enum ModeName {
     /// Closed loop: the policy observes the table before each step.
     ClosedLoop,
-    /// Open loop, precomputed in the training simulator, as in the paper.
+    /// Open loop, rehearsed in the training world and on copies of the pair.
     OpenLoop,
     /// Open loop, precomputed on a copy of the simulated pair.
     Twin,
