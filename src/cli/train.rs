@@ -40,7 +40,7 @@ Examples:
   tandem train --arms 1 --recipe paper --print-run > my-run.toml
       # every setting of this run
   tandem train --run my-run.toml --out runs/mine --quiet
-  tandem train --recipe paper --teacher runs/teacher-push-paper
+  tandem train --run deploy/push-paper.toml --teacher runs/teacher-push-paper
   tandem train --env 127.0.0.1:7005  # plays in the environments of a server
   tandem train --env-command 'tandem env'
       # each worker starts a server of its own

@@ -217,9 +217,8 @@ impl TeacherFile {
         }
         Some(format!(
             "the teacher {} was trained with recipe {trained_with:?}, whose values have another range: for the paper's, \
-             train one with `tandem train --run deploy/teacher-{}-paper.toml` and name it with --teacher",
-            self.path.display(),
-            self.layout.name()
+             train one for the same task with `tandem train --arms 1 --recipe paper` and name it with --teacher",
+            self.path.display()
         ))
     }
 
