@@ -182,8 +182,8 @@ pub(crate) struct EnvironmentArgs {
     /// Deadline of the start of the environment command and of each reply of the server, seconds [default: 60].
     #[arg(long, value_name = "S", value_parser = seconds)]
     pub(crate) env_timeout_s: Option<Duration>,
-    /// File with the access token of the server at --env [default: --token-file, if there is one and --env-tls-ca is not
-    /// given].
+    /// File with the access token of the server at --env
+    /// [default: --token-file, if there is one and --env-tls-ca is not given].
     #[arg(long, value_name = "FILE", requires = "env")]
     pub(crate) env_token_file: Option<PathBuf>,
     /// Connects to the server at --env by TLS and trusts certificates signed by this authority (PEM)
