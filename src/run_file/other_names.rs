@@ -9,7 +9,7 @@ const OTHER_NAMES: [(&[&str], &str); 16] = [
     (&["actor_lr", "pi_lr", "policy_lr"], "ddpg.actor_learning_rate"),
     (&["critic_lr", "q_lr"], "ddpg.critic_learning_rate"),
     (&["learning_starts", "start_steps"], "rounds.warmup_env_steps"),
-    (&["gradient_steps", "utd", "utd_ratio"], "rounds.updates_per_env_step"),
+    (&["gradient_steps", "train_freq", "utd", "utd_ratio"], "rounds.updates_per_env_step"),
     (&["n_envs", "num_envs"], "rounds.slots times rounds.rollouts"),
     (&["total_timesteps", "total_steps"], "stop.max_env_steps"),
     (&["net_arch", "hidden_sizes"], "ddpg.n_hidden and ddpg.n_hidden_layers"),
@@ -42,6 +42,7 @@ mod tests {
             assert!(known.iter().any(|known| known == name), "{name}");
         }
         assert_eq!(meaning("ddpg.gamma"), meaning("gamma"));
+        assert_eq!(meaning("train_freq"), meaning("gradient_steps"));
         assert_eq!(meaning("discount"), None);
     }
 }
