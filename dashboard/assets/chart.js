@@ -3,7 +3,8 @@ import { el, isNumber, svg } from "/assets/common.js";
 
 /** End of the horizontal axis while all points are at its start, environment steps. */
 const FIRST_STEPS = 1000;
-const MARGIN = { left: 46, right: 12, top: 10, bottom: 36 };
+/** Margins, pixels. The last label of the horizontal axis may end in the right one. */
+const MARGIN = { left: 46, right: 28, top: 10, bottom: 36 };
 
 /** Returns about `n` round numbers from `low` to `high`. */
 function ticks(low, high, n) {

@@ -38,10 +38,11 @@ export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-const grouped = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+const grouped = new Intl.NumberFormat("en", { maximumFractionDigits: 0, signDisplay: "negative" });
 export const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 export const count = (value) => (isNumber(value) ? grouped.format(value) : "–");
-export const percent = (value, digits = 1) => (isNumber(value) ? `${(100 * value).toFixed(digits)} %` : "–");
+/** Formats a share. The space does not break, so that no line begins with the sign. */
+export const percent = (value, digits = 1) => (isNumber(value) ? `${(100 * value).toFixed(digits)}\u00a0%` : "–");
 
 /** Formats a real number with about three significant digits. */
 export function real(value) {

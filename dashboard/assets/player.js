@@ -6,7 +6,7 @@ const MIN_STEP_MS = 80;
 const HALF_OBJECT_M = 0.0225;
 /** Width of a view, and what is drawn above a hand as seen from above (beyond its fingers) and from the side: pixels. */
 const WIDTH_PX = 600;
-const ABOVE_HAND_PX = { 1: 34, 2: 62 };
+const ABOVE_HAND_PX = { 1: 42, 2: 68 };
 /** Half of the smallest gap that is drawn between the fingers, metres. */
 const MIN_GAP_M = 0.012;
 

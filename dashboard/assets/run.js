@@ -15,10 +15,20 @@ let latest = null;
 let evaluations = null;
 let hasPlayback = null;
 
-/** Returns `value` for rows after the first update: before it there is no loss, and no Q of a trained critic. */
-const learned = (value) => (row) => (row.updates > 0 ? value(row) : null);
+/**
+ * Returns `value` for rows after the first update: before it there is no loss, and no Q of a trained critic. The loss is zero
+ * until the round of the first update has ended.
+ */
+const learned = (value) => (row) => (row.updates > 0 && row.critic_loss !== 0 ? value(row) : null);
 /** Returns the success in training, which the row of the initial policy does not have. */
 const trained = (row) => (row.episodes > 0 ? row.training_success : null);
+
+/** Returns the series of the chart of success. One arm has no other to touch. */
+const successSeries = (nArms) => [
+  { name: "success", class: "first", value: (row) => row.success, low: (row) => row.success_low, high: (row) => row.success_high },
+  nArms > 1 && { name: "without contact between arms", class: "second", value: (row) => row.success_without_contact },
+  { name: "training", class: "third", value: trained },
+].filter(Boolean);
 
 const charts = [
   new Chart(byId("success-chart"), {
@@ -29,11 +39,7 @@ const charts = [
     tick: (value) => `${Math.round(100 * value)} %`,
     bandName: "95 % interval",
     best: (row) => row.best,
-    series: [
-      { name: "success", class: "first", value: (row) => row.success, low: (row) => row.success_low, high: (row) => row.success_high },
-      { name: "without contact between arms", class: "second", value: (row) => row.success_without_contact },
-      { name: "training", class: "third", value: trained },
-    ],
+    series: [],
   }),
   new Chart(byId("q-chart"), {
     label: "Mean Q",
@@ -57,7 +63,8 @@ const charts = [
 ];
 
 function tiles(s) {
-  const interval = (low, high) => (isNumber(low) ? `interval ${(100 * low).toFixed(1)} – ${percent(high)}` : "no evaluation yet");
+  const interval = (low, high) => (isNumber(low) ? `interval ${(100 * low).toFixed(1)} – ${percent(high)}`
+    : latest ? "not reported" : "no evaluation yet");
   const usesAdvice = s.advice_spent + s.advice_left > 0;
   return [
     ["Success", percent(latest?.success), interval(latest?.success_low, latest?.success_high)],
@@ -183,7 +190,7 @@ function showAdvice(s) {
     const steps = arm.teacher + arm.student;
     const shares = [arm.teacher / steps, arm.student / steps];
     const texts = [`teacher ${percent(shares[0])} (${count(arm.teacher)} steps)`, `student ${percent(shares[1])} (${count(arm.student)} steps)`];
-    return { title: `Arm ${idx}: who acted in training`, shares, texts };
+    return { title: `Arm ${idx}: who acted since the learner started`, shares, texts };
   });
   const spent = s.advice_spent / total;
   showShares(byId("shares"), [{
@@ -229,12 +236,19 @@ function showServices(s) {
 function showEvaluations(rows) {
   const table = byId("success-table");
   if (!table.closest("details").open) return table.replaceChildren();
-  const names = ["Env steps", "Success", "95 % interval", "Without contact", "Training", "Mean Q", "Critic loss", "Actor loss", "Advice"];
-  const cells = (row) => [count(row.env_steps), percent(row.success), `${percent(row.success_low)} – ${percent(row.success_high)}`,
-    percent(row.success_without_contact), percent(trained(row)),
-    ...["mean_q", "critic_loss", "actor_loss"].map((name) => real(learned((it) => it[name])(row))),
-    count(row.advice_spent)];
-  showTable(table, names, [...rows].reverse().map(cells));
+  const loss = (name) => (row) => real(learned((it) => it[name])(row));
+  const columns = [
+    ["Env steps", (row) => count(row.env_steps)],
+    ["Success", (row) => percent(row.success)],
+    ["95 % interval", (row) => `${percent(row.success_low)} – ${percent(row.success_high)}`],
+    state?.n_arms > 1 && ["Without contact", (row) => percent(row.success_without_contact)],
+    ["Training", (row) => percent(trained(row))],
+    ["Mean Q", loss("mean_q")],
+    ["Critic loss", loss("critic_loss")],
+    ["Actor loss", loss("actor_loss")],
+    ["Advice", (row) => count(row.advice_spent)],
+  ].filter(Boolean);
+  showTable(table, columns.map(([name]) => name), [...rows].reverse().map((row) => columns.map(([, text]) => text(row))));
 }
 
 /** Says why there is no episode to play. */
@@ -254,6 +268,7 @@ function show(s) {
     player.reset();
     latest = evaluations = null;
   }
+  if (state?.n_arms !== s.n_arms) charts[0].setSeries(successSeries(s.n_arms));
   state = s;
   showHeader(s);
   showTiles(byId("tiles"), tiles(s));

@@ -241,7 +241,11 @@ impl Feed {
                 true => view.runs.iter().map(env_steps_at_end).sum(),
                 false => 0,
             },
-            env_steps_per_s: live.iter().map(|run| run.pace.env_steps_per_s).sum(),
+            // The sum of no numbers is −0, which readers would see.
+            env_steps_per_s: live
+                .iter()
+                .map(|run| run.pace.env_steps_per_s)
+                .fold(0.0, |sum, it| sum + it),
             live,
             versions: self.versions,
         })
@@ -348,6 +352,14 @@ mod tests {
             (&1.into(), &400.into())
         );
         assert_eq!(json(frame.documents["runs"].text())[0]["state"], "finished");
+    }
+
+    #[test]
+    fn a_sweep_without_a_running_run_makes_no_steps_per_second() {
+        let view =
+            SweepView { runs: vec![run("a", SweepRunState::Failed)], ..SweepView::default() };
+        let state = Feed::default().state(&view);
+        assert!(state.contains("\"env_steps_per_s\":0.0"), "{state}");
     }
 
     #[test]

@@ -52,8 +52,8 @@ evaluation.recorded_episodes = 0
 class Run:
     """A run of `tandem train` with a dashboard. A context manager."""
 
-    def __init__(self, program, directory, max_env_steps):
-        settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    def __init__(self, program, directory, max_env_steps, *options):
+        settings = [*(part for setting in SETTINGS for part in ("--set", setting)), *options]
         command = [program, "train", "--seed", "1", "--workers", "2", "--max-env-steps", str(max_env_steps),
                    "--out", str(directory / "push-demo"), *settings]
         self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
@@ -179,7 +179,7 @@ RAISED = """{ round: 1, step_s: 0.04, tolerance_m: 0.05, is_cube: false, bases: 
 
 
 def check_drawings(page):
-    """The axis of a chart with one point at the start has whole steps, and raised hands and their names are not cut."""
+    """Axes have whole steps; labels and raised hands are not cut, also on a phone, where names can be read."""
     page.value("""import('/assets/chart.js').then(({ Chart }) => {
       const parent = document.body.appendChild(document.createElement('div'));
       const series = [{ name: 'it', class: 'first', value: (row) => row.y }];
@@ -187,18 +187,34 @@ def check_drawings(page):
       window.chart = parent; })""")
     ticks = page.value("[...window.chart.querySelectorAll('text[text-anchor=middle]')].map(it => it.textContent)")
     assert ticks == ["0", "200", "400", "600", "800", "1000", "environment steps"], ticks
-    cut = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
-      document.getElementById('player').hidden = false;
-      new Player().load({RAISED});
-      return ['view-above', 'view-side'].flatMap(id => {{
-        const root = document.getElementById(id), box = root.getBoundingClientRect();
-        return [...root.querySelectorAll('text, .palm, .finger')].filter(it => {{
-          const {{ left, right, top, bottom }} = it.getBoundingClientRect();
-          return left < box.left || right > box.right || top < box.top || bottom > box.bottom;
-        }}).map(it => `${{id}} ${{it.outerHTML}}`);
-      }});
-    }})""")
+    cut = page.value("""import('/assets/chart.js').then(({ Chart }) => [8_000, 40_000, 125_000, 1_250_000].flatMap((last) => {
+      const parent = document.body.appendChild(document.createElement('div'));
+      const series = [{ name: 'it', class: 'first', value: (row) => row.y }];
+      new Chart(parent, { label: 'labels', series }).show([{ env_steps: 0, y: 1 }, { env_steps: last, y: 2 }]);
+      const { right } = parent.querySelector('svg[role=img]').getBoundingClientRect();
+      const cut = [...parent.querySelectorAll('text')].filter(it => it.getBoundingClientRect().right > right);
+      parent.remove();
+      return cut.map(it => it.textContent);
+    }))""")
     assert cut == [], cut
+    texts = page.value("import('/assets/common.js').then(({ count, percent }) => [count(-0.2), percent(0.5)])")
+    assert texts == ["0", "50.0\u00a0%"], texts
+    for width in (360, 1280):
+        page.resize(width, 900)
+        cut = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
+          document.getElementById('player').hidden = false;
+          new Player().load({RAISED});
+          return ['view-above', 'view-side'].flatMap(id => {{
+            const root = document.getElementById(id), box = root.getBoundingClientRect();
+            return [...root.querySelectorAll('text, .palm, .finger')].filter(it => {{
+              const {{ left, right, top, bottom }} = it.getBoundingClientRect();
+              return left < box.left || right > box.right || top < box.top || bottom > box.bottom;
+            }}).map(it => `${{id}} ${{it.outerHTML}}`);
+          }});
+        }})""")
+        assert cut == [], (width, cut)
+        heights = page.value("[...document.querySelectorAll('.views text')].map(it => it.getBoundingClientRect().height)")
+        assert heights and min(heights) > 11, (width, heights)
 
 
 def check_pause(page):
@@ -264,6 +280,17 @@ def check_layout(page):
     for _ in page.layouts():
         pass
     page.check_names()
+
+
+def check_one_arm(browser, program, directory):
+    """The page of a run with one arm has nothing about contact between arms."""
+    with Run(program, directory / "one-arm", 1_000_000, "--arms", "1") as run:
+        page = browser.open(run.url)
+        page.wait("document.querySelectorAll('#success-chart circle.dot.first').length >= 1", "an evaluation is drawn", 60)
+        page.value("document.getElementById('success-table').closest('details').open = true")
+        page.wait("document.querySelectorAll('#success-table tbody tr').length > 0", "the table is filled")
+        found = page.value("document.querySelector('main').innerText.match(/.*contact.*/gi)")
+        assert found is None, found
 
 
 def check_sweep(browser, program, directory, pictures):
@@ -429,6 +456,7 @@ def main():
             page.wait("document.getElementById('link').textContent.includes('final values')", "the service has ended")
             page.take_pictures(args.pictures, "end")
             check_errors(page)
+        check_one_arm(browser, args.program.resolve(), pathlib.Path(directory))
         check_sweep(browser, args.program.resolve(), pathlib.Path(directory), args.pictures)
     print(f"the dashboards passed in {time.monotonic() - began:.0f} s")
 
