@@ -2,8 +2,8 @@
 
 use plotters::coord::Shift;
 use plotters::prelude::{
-    ChartBuilder, Color as _, DrawingArea, IntoDrawingArea as _, IntoFont as _, LineSeries,
-    Polygon, RGBColor, Rectangle, SVGBackend, Text, TextStyle, WHITE,
+    ChartBuilder, Color as _, DashedLineSeries, DrawingArea, IntoDrawingArea as _, IntoFont as _,
+    LineSeries, Polygon, RGBColor, Rectangle, SVGBackend, Text, TextStyle, WHITE,
 };
 use tandem_telemetry::MetricsRow;
 
@@ -18,7 +18,7 @@ pub(crate) mod layout;
 mod marker;
 
 /// Colours of the series, distinguishable by colour-blind readers and of different brightness. Markers distinguish
-/// them without colours. Further series reuse both.
+/// them without colours. Further series reuse both, with dashed lines.
 const COLORS: [RGBColor; 6] = [
     RGBColor(0x00, 0x5f, 0xa8),
     RGBColor(0xe0, 0x7b, 0x28),
@@ -174,9 +174,9 @@ impl CurveOptions {
 /// A drawing as SVG, at the width of half a page and at that of a phone; a page shows one of them.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Drawing {
-    /// For wide screens and for print.
+    /// For wide screens.
     pub(crate) wide: String,
-    /// For narrow screens.
+    /// For narrow screens, and for print with two columns.
     pub(crate) narrow: String,
 }
 
@@ -239,7 +239,12 @@ fn draw_header(root: &Area<'_>, legend: &[LegendEntry], options: &CurveOptions) 
     for (idx, LegendEntry { name, left, line }) in legend.iter().enumerate() {
         let (color, middle) = (COLORS[idx % COLORS.len()], legend_top_px(options) + 7);
         let middle = middle + LEGEND_LINE_PX * line;
-        root.draw(&Rectangle::new([(*left, middle - 1), (left + 16, middle + 1)], color.filled()))?;
+        // A dashed line has a gap on both sides of its marker.
+        let dashes = if idx < COLORS.len() { &[(0, 16)][..] } else { &[(-2, 1), (15, 18)] };
+        for (begin, end) in dashes {
+            let corners = [(left + begin, middle - 1), (left + end, middle + 1)];
+            root.draw(&Rectangle::new(corners, color.filled()))?;
+        }
         marker::draw_in_legend(root, idx, (left + 8, middle), color)?;
         let mut top = middle - 7;
         for line in name {
@@ -297,7 +302,10 @@ fn draw_plot(plot: &Area<'_>, series: &[Series], options: &CurveOptions) -> Draw
     for (idx, one) in series.iter().enumerate() {
         let color = COLORS[idx % COLORS.len()];
         let line = one.points.iter().map(|point| (point.x, point.y));
-        chart.draw_series(LineSeries::new(line, color.stroke_width(2)))?;
+        match idx < COLORS.len() {
+            true => chart.draw_series(LineSeries::new(line, color.stroke_width(2)))?,
+            false => chart.draw_series(DashedLineSeries::new(line, 6, 4, color.stroke_width(2)))?,
+        };
         marker::draw(&mut chart, idx, &marked_points(one), color)?;
     }
     Ok(())
@@ -358,9 +366,14 @@ mod tests {
 
     #[test]
     fn a_row_without_a_value_is_omitted_from_the_curve() {
-        let row = |mean_q| MetricsRow { mean_q, ..MetricsRow::default() };
-        let series =
-            Series::of("run", &[row(f64::NAN), row(-3.0)], Axis::EnvSteps, Quantity::MeanQ);
+        let row = |mean_q| MetricsRow { updates: 1, mean_q, ..MetricsRow::default() };
+        let initial = MetricsRow { mean_q: 0.0, ..MetricsRow::default() };
+        let series = Series::of(
+            "run",
+            &[initial, row(f64::NAN), row(-3.0)],
+            Axis::EnvSteps,
+            Quantity::MeanQ,
+        );
         assert_eq!(series.points, [CurvePoint { x: 0.0, y: -3.0, band: None }]);
     }
 

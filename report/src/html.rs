@@ -21,19 +21,21 @@ pub(crate) fn page(title: &str, body: &str) -> String {
 /// Returns a table below its title.
 pub(crate) fn titled_table(titled: &Table) -> String {
     let header: Vec<&str> = titled.header.iter().map(String::as_str).collect();
-    format!("<h3>{}</h3>{}", escaped(&titled.title), table(&header, &titled.rows))
+    format!("<h3>{}</h3>{}", escaped(&titled.title), table(&titled.title, &header, &titled.rows))
 }
 
-/// Returns a table that scrolls if it is wider than the page. Ranges and intervals are below their values.
-pub(crate) fn table(header: &[&str], rows: &[Vec<String>]) -> String {
+/// Returns a table that scrolls if it is wider than the page, by keyboard too. Ranges and intervals are below their
+/// values.
+pub(crate) fn table(title: &str, header: &[&str], rows: &[Vec<String>]) -> String {
     let head: String = header.iter().map(|cell| format!("<th>{}</th>", escaped(cell))).collect();
     let row = |cells: &Vec<String>| {
         let cells: String = cells.iter().map(|cell| format!("<td>{}</td>", value(cell))).collect();
         format!("<tr>{cells}</tr>")
     };
     let body: String = rows.iter().map(row).collect();
+    let title = escaped(title);
     format!(
-        "<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+        "<div class=scroll tabindex=0 role=region aria-label=\"{title}\"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 }
 

@@ -8,13 +8,13 @@ use crate::comparison::{Baseline, Comparison, Section};
 use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Series, curve_drawing};
 use crate::error::Error;
 use crate::group::SeedGroup;
-use crate::paper::split_strategy;
 use crate::quantity::Quantity;
+use panels::{FAMILIES, STRATEGIES, panels};
+
+mod panels;
 
 /// Maximum number of curves in a plot of other runs, or of learning from scratch.
 const MAX_CURVES: usize = 6;
-/// Threshold that represents a strategy where strategies are compared (the paper's Figures 5a to 8a).
-const USUAL_THRESHOLD: f64 = 0.1;
 
 /// A plot and the name of its file.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,18 +29,6 @@ pub struct Plot {
     pub narrow_svg: String,
 }
 
-/// Groups that share a plot.
-#[derive(Debug, Clone)]
-struct Panel<'a> {
-    /// Part of the file name.
-    slug: String,
-    /// Part of the title.
-    title: String,
-    /// Letter of this panel in the paper's figures, `a` to `d`, if the paper has it.
-    letter: Option<char>,
-    groups: Vec<&'a SeedGroup>,
-}
-
 /// Plots of each panel: name, quantity, axis, and the number of the paper's figure for push and for pick and place.
 const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 7] = [
     ("success", Quantity::Success, Axis::EnvSteps, None),
@@ -51,10 +39,6 @@ const VIEWS: [(&str, Quantity, Axis, Option<[u32; 2]>); 7] = [
     ("success", Quantity::Success, Axis::PaperEpochs, Some([5, 7])),
     ("mean Q", Quantity::MeanQ, Axis::PaperEpochs, Some([6, 8])),
 ];
-/// Slug and title of the panel that compares strategies.
-const STRATEGIES: &str = "strategies";
-/// Strategies with a threshold, and the letter of the panel that compares their thresholds.
-const FAMILIES: [(&str, char); 3] = [("mc-q", 'b'), ("mc-act", 'c'), ("mc-act-abs", 'd')];
 /// End of the slug of a plot of learning from scratch, after the task.
 const FROM_SCRATCH: &str = "-from-scratch";
 /// Number of [`VIEWS`] that a page shows first.
@@ -78,7 +62,7 @@ impl ComparisonPlots {
 
 /// Returns the number of a section's plots that a page shows first.
 pub(crate) fn n_first_plots(section: &Section) -> usize {
-    N_FIRST_VIEWS - usize::from(!section.has_success_without_contact())
+    VIEWS[..N_FIRST_VIEWS].iter().filter(|(_, quantity, ..)| section.shows(*quantity)).count()
 }
 
 /// Draws all plots of a comparison.
@@ -93,10 +77,14 @@ pub fn comparison_plots(comparison: &Comparison) -> Result<ComparisonPlots, Erro
 /// Draws the plots of one section.
 fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
     let mut plots = Vec::new();
-    for panel in panels(&section.groups) {
+    let panels = panels(&section.groups);
+    for panel in &panels {
+        let of_panel = match panels.len() {
+            1 => String::new(),
+            _ => format!(", {}", panel.title),
+        };
         for (name, quantity, axis, paper) in VIEWS {
-            if quantity == Quantity::SuccessWithoutContact && !section.has_success_without_contact()
-            {
+            if !section.shows(quantity) {
                 continue;
             }
             let reference = paper.zip(panel.letter).zip(section.setup.built_in());
@@ -108,7 +96,7 @@ fn section_plots(section: &Section) -> Result<Vec<Plot>, Error> {
                     format!(" (the paper's Figure {number}{letter})")
                 });
             let (setup, against) = (section.setup.title(), axis.against());
-            let title = format!("{setup}: {name} {against}, {}{reference}", panel.title);
+            let title = format!("{setup}: {name} {against}{of_panel}{reference}");
             let slug = format!("{}-{name}-{}-{}", section.setup.slug(), axis.slug(), panel.slug);
             let curves = (panel.groups.as_slice(), section.baselines.as_slice());
             plots.push(draw(curves, &title, &slug, quantity, axis)?);
@@ -244,83 +232,6 @@ fn mean(values: &[(f64, f64)]) -> CurvePoint {
     }
 }
 
-/// Distributes all groups over panels: strategies, thresholds of each strategy, and other runs.
-fn panels(groups: &[SeedGroup]) -> Vec<Panel<'_>> {
-    let plain: Vec<&SeedGroup> = groups.iter().filter(|group| group.is_plain_strategy()).collect();
-    let mut panels = Vec::new();
-    let strategies: Vec<&SeedGroup> =
-        plain.iter().filter(|group| represents_strategy(group, &plain)).copied().collect();
-    if !strategies.is_empty() {
-        panels.push(Panel {
-            slug: STRATEGIES.to_owned(),
-            title: STRATEGIES.to_owned(),
-            letter: Some('a'),
-            groups: strategies,
-        });
-    }
-    for (family, letter) in FAMILIES {
-        let members: Vec<&SeedGroup> =
-            plain.iter().filter(|group| strategy_name(group) == family).copied().collect();
-        if members.len() > 1 {
-            panels.push(Panel {
-                slug: family.to_owned(),
-                title: format!("thresholds of {family}"),
-                letter: Some(letter),
-                groups: members,
-            });
-        }
-    }
-    let is_shown = |group: &&SeedGroup| {
-        panels.iter().any(|panel| panel.groups.iter().any(|shown| std::ptr::eq(*shown, *group)))
-    };
-    let others: Vec<&SeedGroup> = groups.iter().filter(|group| !is_shown(group)).collect();
-    let n_further = others.len().div_ceil(MAX_CURVES - 2);
-    let further = others.chunks(MAX_CURVES - 2).enumerate().map(|(idx, others)| Panel {
-        slug: format!("others-{}", idx + 1),
-        title: match n_further {
-            1 => "other runs".to_owned(),
-            _ => format!("other runs, {} of {n_further}", idx + 1),
-        },
-        letter: None,
-        groups: with_their_strategies(others, &plain),
-    });
-    panels.extend(further.collect::<Vec<_>>());
-    panels
-}
-
-/// Returns `others`, preceded by the plain strategies of which they are variants.
-fn with_their_strategies<'a>(
-    others: &[&'a SeedGroup],
-    plain: &[&'a SeedGroup],
-) -> Vec<&'a SeedGroup> {
-    let is_origin = |group: &&&SeedGroup| {
-        others.iter().any(|other| {
-            (&other.strategy, &other.setup) == (&group.strategy, &group.setup)
-                && !std::ptr::eq(**group, *other)
-        })
-    };
-    plain.iter().filter(is_origin).chain(others).copied().collect()
-}
-
-/// Returns whether a group represents its strategy: it has the usual threshold, or the largest if no group has that.
-fn represents_strategy(group: &SeedGroup, all: &[&SeedGroup]) -> bool {
-    let threshold =
-        |group: &SeedGroup| split_strategy(group.strategy.as_deref().unwrap_or_default()).1;
-    let Some(own) = threshold(group) else { return true };
-    let family: Vec<f64> = all
-        .iter()
-        .filter(|other| strategy_name(other) == strategy_name(group))
-        .filter_map(|other| threshold(other))
-        .collect();
-    let has_usual = family.contains(&USUAL_THRESHOLD);
-    let chosen = if has_usual { USUAL_THRESHOLD } else { family.into_iter().fold(own, f64::max) };
-    own == chosen
-}
-
-fn strategy_name(group: &SeedGroup) -> &str {
-    split_strategy(group.strategy.as_deref().unwrap_or_default()).0
-}
-
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
@@ -332,7 +243,7 @@ mod tests {
     use crate::run::Run;
     use crate::test_evaluation::TestEvaluation;
 
-    fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
+    pub(super) fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
         let row = |(env_steps, wall_s, success): &(u64, f64, f64)| MetricsRow {
             env_steps: *env_steps,
             wall_s: *wall_s,
@@ -350,7 +261,7 @@ mod tests {
         }
     }
 
-    fn plain(strategy: &str) -> Run {
+    pub(super) fn plain(strategy: &str) -> Run {
         run(strategy, 1, &strategy.replace(':', "-"), &[(1000, 60.0, 0.5)])
     }
 
@@ -388,59 +299,32 @@ mod tests {
     }
 
     #[test]
-    fn panels_are_those_of_the_paper_and_show_every_group() {
-        let strategies = [
-            "none",
-            "ea",
-            "eamc:0.1",
-            "mc-q:0.01",
-            "mc-q:0.05",
-            "mc-q:0.1",
-            "mc-act:0.01",
-            "mc-act:0.05",
-            "mc-act-abs:0.1",
-        ];
-        let mut runs: Vec<Run> = strategies.map(plain).into();
-        runs.push(run("mc-q:0.1", 1, "no-cloning", &[(1000, 60.0, 0.5)]));
-        let groups = group_by_settings(runs);
-        let actual: Vec<(String, Option<char>, Vec<&str>)> = panels(&groups)
-            .into_iter()
-            .map(|panel| {
-                let labels = panel.groups.iter().map(|group| group.label.as_str()).collect();
-                (panel.slug, panel.letter, labels)
-            })
-            .collect();
-        let expected = [
-            (
-                "strategies",
-                Some('a'),
-                vec!["none", "ea", "eamc:0.1", "mc-q:0.1", "mc-act:0.05", "mc-act-abs:0.1"],
-            ),
-            ("mc-q", Some('b'), vec!["mc-q:0.01", "mc-q:0.05", "mc-q:0.1"]),
-            ("mc-act", Some('c'), vec!["mc-act:0.01", "mc-act:0.05"]),
-            ("others-1", None, vec!["mc-q:0.1", "no-cloning"]),
-        ];
-        assert_eq!(
-            actual,
-            expected.map(|(slug, letter, labels)| (slug.to_owned(), letter, labels))
-        );
-    }
-
-    #[test]
     fn plots_have_unique_names_and_refer_to_the_papers_figures() {
         let runs = vec![plain("none"), plain("mc-q:0.05"), plain("mc-q:0.1")];
         let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
         let plots: Vec<&Plot> = plots.all().collect();
-        assert_eq!(plots.len(), 12);
-        assert_eq!(plots[4].file_name, "push-2-success-paper-epochs-strategies.svg");
-        assert!(plots[4].title.ends_with("(the paper's Figure 5a)"), "{}", plots[4].title);
-        assert!(plots[11].title.ends_with("(the paper's Figure 6b)"), "{}", plots[11].title);
+        assert_eq!(plots.len(), 10, "none of advice, which the runs did not take");
+        assert_eq!(plots[3].file_name, "push-2-success-paper-epochs-strategies.svg");
+        assert!(plots[3].title.ends_with("(the paper's Figure 5a)"), "{}", plots[3].title);
+        assert!(plots[9].title.ends_with("(the paper's Figure 6b)"), "{}", plots[9].title);
         for text in [|plot: &Plot| plot.file_name.clone(), |plot: &Plot| plot.title.clone()] {
             let unique: BTreeSet<String> = plots.iter().map(|plot| text(plot)).collect();
-            assert_eq!(unique.len(), 12, "{unique:?}");
+            assert_eq!(unique.len(), 10, "{unique:?}");
         }
         let stem = |plot: &&Plot| plot.file_name.trim_end_matches(".svg").to_owned();
         assert!(plots.iter().map(stem).all(|stem| is_file_stem(&stem)));
+    }
+
+    #[test]
+    fn titles_name_a_panel_only_if_there_are_several() {
+        let title = |runs| {
+            let plots = comparison_plots(&Comparison::of(runs, Vec::new())).unwrap();
+            plots.sections[0][0].title.clone()
+        };
+        let alone = title(vec![plain("none"), plain("mc-q:0.1")]);
+        assert_eq!(alone, "push, 2 arms: success against environment steps");
+        let several = title(vec![plain("mc-q:0.05"), plain("mc-q:0.1")]);
+        assert_eq!(several, "push, 2 arms: success against environment steps, strategies");
     }
 
     #[test]

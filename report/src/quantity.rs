@@ -56,6 +56,8 @@ impl Quantity {
             Self::Moved => row.moved,
             Self::CollisionRate => row.collision_rate,
             Self::CollisionRateBeforeSuccess => row.collision_rate_before_success,
+            // The critic of the initial policy has learned nothing, and its rows have a zero.
+            Self::MeanQ if row.updates == 0 => f64::NAN,
             Self::MeanQ => row.mean_q,
             Self::AdviceSpent => row.advice_spent as f64,
         }

@@ -49,6 +49,11 @@ impl Run {
         Ok(Self { name: directory_name(dir), rows, configuration, test, teacher: teacher_of(dir) })
     }
 
+    /// Returns whether the run has taken advice.
+    pub(crate) fn took_advice(&self) -> bool {
+        self.rows.iter().any(|row| row.advice_spent > 0)
+    }
+
     /// Reads a metrics file without a run directory.
     ///
     /// # Errors

@@ -23,7 +23,9 @@ fn row(round: u32, n_hits: u8) -> MetricsRow {
         round: u64::from(round),
         env_steps: u64::from(round) * 1600,
         wall_s: 60.0 * f64::from(round),
+        updates: u64::from(round) * 40,
         paper_epochs: f64::from(round) / 50.0,
+        advice_spent: u64::from(round),
         success,
         success_low: interval.low,
         success_high: interval.high,
@@ -80,12 +82,25 @@ fn a_single_curve_has_no_legend_and_may_be_empty() {
 }
 
 #[test]
+fn curves_beyond_the_number_of_colours_are_dashed() {
+    let rows = [row(0, 0), row(10, 120)];
+    let n_lines = |n: usize| {
+        let series: Vec<Series> = (0..n)
+            .map(|idx| Series::of(&idx.to_string(), &rows, Axis::EnvSteps, Quantity::Success))
+            .collect();
+        let options = CurveOptions::of("Success", Quantity::Success, Axis::EnvSteps);
+        curve_svg(&series, &options).unwrap().matches("stroke=\"#005FA8\"").count()
+    };
+    assert!(n_lines(6) < n_lines(7) - 10, "{} {}", n_lines(6), n_lines(7));
+}
+
+#[test]
 fn curves_can_be_drawn_against_every_axis() {
     let rows = [row(10, 120)];
     let x = |axis| Series::of("", &rows, axis, Quantity::Success).points[0].x;
     assert_eq!(
         [Axis::EnvSteps, Axis::Updates, Axis::Minutes, Axis::PaperEpochs].map(x),
-        [16_000.0, 0.0, 10.0, 0.2]
+        [16_000.0, 400.0, 10.0, 0.2]
     );
 }
 
@@ -112,6 +127,30 @@ fn the_page_of_a_run_loads_nothing_from_elsewhere() {
     for reference in ["<script", "<link", "src=\"http", "@import", "url(http"] {
         assert!(!page.contains(reference), "{reference}");
     }
+}
+
+#[test]
+fn the_page_of_one_arm_without_advice_has_nothing_about_either() {
+    let alone = |round, n_hits| MetricsRow {
+        advice_spent: 0,
+        contacts: ContactMetrics {
+            success_without_contact: Some(0.5),
+            success_without_contact_low: Some(0.4),
+            success_without_contact_high: Some(0.6),
+            ..ContactMetrics::default()
+        },
+        ..row(round, n_hits)
+    };
+    let dir = run_dir(&[alone(0, 0), alone(5, 60)]);
+    std::fs::write(dir.path().join("run.toml"), "task = \"push\"\narms = 1\n").unwrap();
+    let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
+    for text in ["without arm contact", "Advice spent", "<span>advice spent"] {
+        assert!(!page.contains(text), "{text}");
+    }
+    assert!(page.contains("tabindex=0 role=region aria-label=\"Evaluations\""));
+    std::fs::write(dir.path().join("run.toml"), "task = \"push\"\narms = 2\n").unwrap();
+    let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
+    assert_eq!(page.matches("without arm contact").count(), 2, "a tile and a column");
 }
 
 #[test]

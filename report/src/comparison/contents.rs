@@ -2,6 +2,8 @@
 
 use super::{Comparison, Section};
 use crate::group::SeedGroup;
+use crate::quantity::Quantity;
+use crate::run::Run;
 
 impl Section {
     /// Returns the head of the first column, which has the labels of the groups.
@@ -28,7 +30,18 @@ impl Section {
 
     /// Returns whether the task reports contacts; true if it is unknown.
     pub(crate) fn reports_contacts(&self) -> bool {
-        self.groups.iter().flat_map(|group| &group.runs).all(crate::run::Run::reports_contacts)
+        self.groups.iter().flat_map(|group| &group.runs).all(Run::reports_contacts)
+    }
+
+    /// Returns whether plots of this metric show something: advice is that of runs that took some.
+    pub(crate) fn shows(&self, quantity: Quantity) -> bool {
+        match quantity {
+            Quantity::SuccessWithoutContact => self.has_success_without_contact(),
+            Quantity::AdviceSpent => {
+                self.groups.iter().flat_map(|group| &group.runs).any(Run::took_advice)
+            }
+            _ => true,
+        }
     }
 
     /// Returns whether the paper has the task; true if it is unknown.
@@ -56,7 +69,6 @@ mod tests {
     use tandem_telemetry::MetricsRow;
 
     use super::*;
-    use crate::run::Run;
 
     fn text(task: &str, n_arms: u64, names: &[&str]) -> String {
         let run = |name: &&str| Run {

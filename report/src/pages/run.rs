@@ -14,18 +14,29 @@ use crate::table::{NONE, duration, interval, number, optional, share, thousands}
 
 /// The tile of a task that reports contacts.
 const CONTACT_TILE: &str = "with contact";
+/// The tile of a run that took advice.
+const ADVICE_TILE: &str = "advice spent";
+/// The column of a task with several arms.
+const WITHOUT_ARM_CONTACT: &str = "without arm contact";
+/// The tile of a task with several arms.
+const WITHOUT_ARM_CONTACT_TILE: &str = "success without arm contact";
 
 /// Returns key values, curves, evaluations and configuration of `run` as HTML.
 pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
     let task = run.task_spec();
-    let has_contacts = task.as_ref().is_none_or(TaskSpec::reports_contacts);
     let mut body = task.as_ref().map(task_line).unwrap_or_default();
     match (run.best(), run.last()) {
         (Some(best), Some(last)) => {
-            let curves = curves(run, task.as_ref(), has_contacts)?;
+            let curves = curves(run, task.as_ref())?;
             body.push_str(&headline(run, best));
             body.push_str(&drawing_grid(&curves));
-            body.push_str(&tiles(best, last, has_contacts));
+            let is_shown = |label: &str| match label {
+                CONTACT_TILE => reports_contacts(task.as_ref()),
+                ADVICE_TILE => run.took_advice(),
+                WITHOUT_ARM_CONTACT_TILE => has_several_arms(task.as_ref()),
+                _ => true,
+            };
+            body.push_str(&tiles(best, last, is_shown));
         }
         _ => body.push_str("<p>No evaluation yet.</p>"),
     }
@@ -34,14 +45,22 @@ pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
         body.push_str(&format!("<h2>Episodes</h2>{}", strips.collect::<String>()));
     }
     if !run.rows.is_empty() {
-        let cells = |row| evaluation_cells(row, has_contacts);
-        let rows: Vec<Vec<String>> = run.rows.iter().map(cells).collect();
-        body.push_str(&details("Evaluations", &table(&EVALUATION_HEADER, &rows)));
+        body.push_str(&details("Evaluations", &evaluations(&run.rows, task.as_ref())));
     }
     if let Some(text) = &run.configuration {
         body.push_str(&details("Configuration", &format!("<pre>{}</pre>", escaped(text))));
     }
     Ok(body)
+}
+
+/// Returns whether the task reports contacts; true if it is unknown.
+fn reports_contacts(task: Option<&TaskSpec>) -> bool {
+    task.is_none_or(TaskSpec::reports_contacts)
+}
+
+/// Returns whether the task has several arms; true if it is unknown.
+fn has_several_arms(task: Option<&TaskSpec>) -> bool {
+    task.is_none_or(|task| task.n_arms() > 1)
 }
 
 /// Returns the task, its number of arms, the length of its episodes and its tolerance.
@@ -82,13 +101,13 @@ fn headline(run: &Run, best: &MetricsRow) -> String {
 }
 
 /// Returns the key values of a run, one tile each.
-fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
+fn tiles(best: &MetricsRow, last: &MetricsRow, is_shown: impl Fn(&str) -> bool) -> String {
     let per_arm: Vec<String> = best.success_per_arm.iter().map(|success| share(*success)).collect();
     let without_contact = best.contacts.success().map(|[success, low, high]| {
         let arm_contact = optional(best.contacts.arm_contact_rate, share);
         let table_contact = optional(best.contacts.table_contact_rate, share);
         (
-            "success without arm contact",
+            WITHOUT_ARM_CONTACT_TILE,
             share(success),
             format!(
                 "95 % interval {:.1}–{:.1} %; contact between arms: {arm_contact}, with table: {table_contact}",
@@ -115,7 +134,7 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
             format!("env steps, {}", duration(best.wall_s)),
         ),
         (
-            "advice spent",
+            ADVICE_TILE,
             thousands(last.advice_spent),
             match last.advice_queries {
                 Some(n) => {
@@ -137,15 +156,13 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, has_contacts: bool) -> String {
             escaped(note)
         )
     };
-    let shown = tiles.iter().filter(|(label, ..)| has_contacts || *label != CONTACT_TILE);
-    format!(
-        "<div class=tiles>{}</div>",
-        without_contact.iter().chain(shown).map(tile).collect::<String>()
-    )
+    let shown = without_contact.iter().chain(&tiles).filter(|(label, ..)| is_shown(label));
+    format!("<div class=tiles>{}</div>", shown.map(tile).collect::<String>())
 }
 
-/// Draws success, mean Q, contacts (if the task reports them) and advice against environment steps.
-fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<Drawing>, Error> {
+/// Draws success, mean Q, contacts (if the task reports them) and advice (if the run took some) against environment
+/// steps.
+fn curves(run: &Run, task: Option<&TaskSpec>) -> Result<Vec<Drawing>, Error> {
     const AXIS: Axis = Axis::EnvSteps;
     let series = |named: &[(&str, Quantity)]| -> Vec<Series> {
         named.iter().map(|(name, quantity)| Series::of(name, &run.rows, AXIS, *quantity)).collect()
@@ -169,11 +186,13 @@ fn curves(run: &Run, task: Option<&TaskSpec>, has_contacts: bool) -> Result<Vec<
         draw("Success", Quantity::Success, &success)?,
         draw("Mean Q", Quantity::MeanQ, &series(&[("", Quantity::MeanQ)]))?,
     ];
-    if has_contacts {
+    if reports_contacts(task) {
         curves.push(draw("Episodes with contact", Quantity::CollisionRate, &contacts)?);
     }
-    let advice = series(&[("", Quantity::AdviceSpent)]);
-    curves.push(draw("Advice spent", Quantity::AdviceSpent, &advice)?);
+    if run.took_advice() {
+        let advice = series(&[("", Quantity::AdviceSpent)]);
+        curves.push(draw("Advice spent", Quantity::AdviceSpent, &advice)?);
+    }
     Ok(curves)
 }
 
@@ -185,13 +204,26 @@ const EVALUATION_HEADER: [&str; 13] = [
     "time",
     "success",
     "95 % interval",
-    "without arm contact",
+    WITHOUT_ARM_CONTACT,
     "joint",
     "contact",
     "moved",
     "mean Q",
     "advice spent",
 ];
+
+/// Returns the table of all evaluations.
+fn evaluations(rows: &[MetricsRow], task: Option<&TaskSpec>) -> String {
+    let is_shown =
+        |idx: &usize| has_several_arms(task) || EVALUATION_HEADER[*idx] != WITHOUT_ARM_CONTACT;
+    let columns: Vec<usize> = (0..EVALUATION_HEADER.len()).filter(is_shown).collect();
+    let header: Vec<&str> = columns.iter().map(|idx| EVALUATION_HEADER[*idx]).collect();
+    let cells = |row| {
+        let cells = evaluation_cells(row, reports_contacts(task));
+        columns.iter().map(|idx| cells[*idx].clone()).collect()
+    };
+    table("Evaluations", &header, &rows.iter().map(cells).collect::<Vec<Vec<String>>>())
+}
 
 fn evaluation_cells(row: &MetricsRow, has_contacts: bool) -> Vec<String> {
     vec![
@@ -206,7 +238,7 @@ fn evaluation_cells(row: &MetricsRow, has_contacts: bool) -> Vec<String> {
         share(row.success_joint),
         if has_contacts { share(row.collision_rate) } else { NONE.to_owned() },
         share(row.moved),
-        number(row.mean_q),
+        number(Quantity::MeanQ.of(row)),
         thousands(row.advice_spent),
     ]
 }
