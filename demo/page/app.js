@@ -137,7 +137,8 @@ class App {
     const step_s = this.facts.control_step_s;
     showDistances(status.distances_m, this.facts.tolerance_m);
     for (const [arm, goal] of status.goals.entries()) {
-      const label = `Goal of the ${ARMS[arm]} cube: ${cm(goal[0])} right, ${cm(goal[1])} back, ${cm(goal[2])} up. Arrow keys move it.`;
+      const [across, along] = [towards(goal[0], "right", "left"), towards(goal[1], "back", "front")];
+      const label = `Goal of the ${ARMS[arm]} cube: ${across}, ${along}, ${cm(goal[2])} up. Arrow keys move it.`;
       $(`goal-${arm}`).ariaLabel = label;
       if (document.activeElement !== $(`height-${arm}`)) $(`height-${arm}`).value = goal[2];
       $(`height-${arm}`).ariaValueText = cm(goal[2]);
@@ -145,8 +146,8 @@ class App {
     $("since-label").textContent = "Since the goals moved";
     $("since").textContent = seconds(status.steps_since_change * step_s);
     const first = status.steps_to_success;
-    $("since-detail").textContent = first === null ? `${status.steps_since_change} control steps`
-      : `reached after ${first} steps`;
+    $("since-detail").textContent = first === null ? counted(status.steps_since_change, "control step")
+      : `reached after ${counted(first, "step")}`;
     if (status.is_success) show(badge, "Both goals reached", "good");
     else if (!status.is_in_reach) show(badge, "A cube is out of reach: restart", "bad");
     else show(badge, `${status.achieved.filter(Boolean).length} of ${status.achieved.length} goals reached`, "");
@@ -421,7 +422,10 @@ function showVerdict(id, text, isGood) {
 }
 
 const tasks = () => [...document.querySelectorAll("input[name=task]")];
+const counted = (n, noun) => `${n} ${noun}${n === 1 ? "" : "s"}`;
 const cm = metres => `${Math.round(100 * metres)} cm`;
+/** Names the direction of a distance, so that nothing is minus one to the right. */
+const towards = (metres, ahead, behind) => `${cm(Math.abs(metres))} ${metres < 0 ? behind : ahead}`;
 const seconds = time_s => `${time_s.toFixed(1)} s`;
 
 function complain(error) {

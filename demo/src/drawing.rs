@@ -77,8 +77,14 @@ impl Drawing {
             half_extents_m: PEDESTAL_HALF_M,
         };
         self.add_cuboid(&pedestal, "pedestal", idx);
-        let post = arm.links.first().map(|link| Capsule { from: arm.base, to: link.from, ..*link });
-        let links: Vec<Capsule> = post.into_iter().chain(arm.links.iter().copied()).collect();
+        // A first link that begins at the base has no post, and no joint with it.
+        let post = arm.links.first().filter(|link| link.from != arm.base);
+        let post = post.map(|link| Capsule { from: arm.base, to: link.from, ..*link });
+        let mut links: Vec<Capsule> = post.into_iter().chain(arm.links.iter().copied()).collect();
+        // The round end of the lowest one is drawn over the pedestal, so it ends there.
+        if let Some(lowest) = links.first_mut() {
+            lowest.from[2] += lowest.radius_m;
+        }
         for link in &links {
             self.add_capsule(link, "link", idx);
         }
@@ -232,6 +238,44 @@ mod tests {
     fn a_hull_goes_around_all_points() {
         let square = [[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [2.0, 2.0], [0.0, 2.0], [1.0, 0.0]];
         assert_eq!(hull(square.to_vec()), [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]);
+    }
+
+    #[test]
+    fn an_arm_has_joints_between_its_links_only() {
+        let link = |low: f32, high: f32| Capsule {
+            from: [0.0, 0.0, low],
+            to: [0.0, 0.0, high],
+            radius_m: 0.05,
+        };
+        let n_joints = |links: Vec<Capsule>| {
+            let arm = ArmScene {
+                base: [0.0; 3],
+                joint_angles_rad: [0.0; 6],
+                joint_points: Vec::new(),
+                links,
+                hand: Vec::new(),
+                end_effector: [0.0; 3],
+            };
+            let table = Cuboid {
+                centre: [0.0, 0.0, -0.1],
+                orientation: [0.0, 0.0, 0.0, 1.0],
+                half_extents_m: [1.0, 1.0, 0.1],
+            };
+            let scene = Scene {
+                time_s: 0.0,
+                arms: vec![arm],
+                objects: Vec::new(),
+                goals: Vec::new(),
+                goal_tolerance_m: 0.05,
+                table,
+            };
+            let shapes = drawing(&scene, &[], 640, 400);
+            shapes["items"]
+                .as_array()
+                .map(|items| items.iter().filter(|it| it["of"] == "joint").count())
+        };
+        assert_eq!(n_joints(vec![link(0.0, 0.3), link(0.3, 0.6)]), Some(1));
+        assert_eq!(n_joints(vec![link(0.2, 0.3), link(0.3, 0.6)]), Some(2), "with a post");
     }
 
     #[test]

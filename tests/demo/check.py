@@ -76,7 +76,8 @@ def place_of(page, arm):
 def centimetres_right(page, arm):
     """Returns how far the goal of an arm is to the right of the centre of the table, as its label says."""
     label = page.value(f"document.getElementById('goal-{arm}').ariaLabel")
-    return int(re.search(r"(-?\d+) cm right", label)[1])
+    distance, direction = re.search(r"(\d+) cm (right|left)", label).groups()
+    return int(distance) * (1 if direction == "right" else -1)
 
 
 def drag(page, arm, right, down):
