@@ -148,7 +148,16 @@ fn evaluations(former: &RunView, view: &RunView, new: &mut New) {
 
 fn evaluation(row: &MetricsRow) -> String {
     let best = if row.best { ", the best so far" } else { "" };
-    format!("Evaluation in round {}: success {:.1} %{best}", row.round, 100.0 * row.success)
+    // The success without contact selects the best policy of several arms.
+    let without_contact =
+        row.contacts.success_without_contact.filter(|_| row.success_per_arm.len() > 1);
+    let without_contact =
+        without_contact.map(|share| format!(", {:.1} % without contact", 100.0 * share));
+    let (round, success) = (row.round, 100.0 * row.success);
+    format!(
+        "Evaluation in round {round}: success {success:.1} %{}{best}",
+        without_contact.unwrap_or_default()
+    )
 }
 
 /// Adds changes of the warning, of the teacher and of its ledger, and the end of the run.
@@ -217,6 +226,8 @@ fn sentence(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
+
+    use tandem_telemetry::ContactMetrics;
 
     use super::*;
 
@@ -289,6 +300,13 @@ mod tests {
         let row = MetricsRow { round: 4, success: 0.5, best: true, ..MetricsRow::default() };
         let texts = events_of(&mut log, &mut view, |view| view.evaluations = Arc::new([row]));
         assert_eq!(texts, "Evaluation in round 4: success 50.0 %, the best so far");
+        let contacts =
+            ContactMetrics { success_without_contact: Some(0.25), ..ContactMetrics::default() };
+        let mut row = MetricsRow { success: 0.5, contacts, ..MetricsRow::default() };
+        assert_eq!(evaluation(&row), "Evaluation in round 0: success 50.0 %", "of one arm");
+        row.success_per_arm = vec![0.5, 0.75];
+        let of_two = "Evaluation in round 0: success 50.0 %, 25.0 % without contact";
+        assert_eq!(evaluation(&row), of_two);
         let texts = events_of(&mut log, &mut view, |view| "no disk".clone_into(&mut view.warning));
         assert_eq!(texts, "No disk");
         assert_eq!(events_of(&mut log, &mut view, |_| ()), "");

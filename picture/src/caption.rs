@@ -22,13 +22,30 @@ pub(crate) enum Corner {
     Right,
 }
 
+/// Returns `text`, or as much of its beginning as fits beside another text of `n_other` characters on the same line.
+pub(crate) fn beside(raster: &Raster, text: &str, n_other: usize) -> String {
+    let size = size(raster);
+    let n_columns =
+        raster.width.saturating_sub(size.val()) / get_raster_width(FontWeight::Regular, size);
+    // Two columns part the texts.
+    let room = n_columns.saturating_sub(n_other + 2);
+    match text.chars().count() {
+        n if n <= room => text.to_owned(),
+        _ => text.chars().take(room.saturating_sub(2)).chain("..".chars().take(room)).collect(),
+    }
+}
+
+fn size(raster: &Raster) -> RasterHeight {
+    match raster.height {
+        ..LARGE_FROM_PX => RasterHeight::Size20,
+        _ => RasterHeight::Size32,
+    }
+}
+
 /// Writes `text` into a corner of `raster`, on the line with this number from the top. Characters that the font lacks, all beyond ASCII, become `?`. A text
 /// that is too wide is cut off.
 pub(crate) fn write(raster: &mut Raster, corner: (Corner, usize), text: &str, color: [u8; 3]) {
-    let size = match raster.height {
-        ..LARGE_FROM_PX => RasterHeight::Size20,
-        _ => RasterHeight::Size32,
-    };
+    let size = size(raster);
     let weight = if color == INK { FontWeight::Regular } else { FontWeight::Bold };
     let (advance, margin) = (get_raster_width(weight, size), size.val() / 2);
     let width = advance * text.chars().count();
@@ -46,5 +63,23 @@ pub(crate) fn write(raster: &mut Raster, corner: (Corner, usize), text: &str, co
                 raster.blend(left + idx * advance + x, top + y, color, *opacity);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_title_leaves_room_for_the_time() {
+        let shown = |width, title: &str| {
+            let raster = Raster { width, height: 300, rgb: Vec::new() };
+            beside(&raster, title, "12.50 s".len())
+        };
+        let title = "shared-pick-and-place, episode 12";
+        assert_eq!(shown(480, title), title);
+        assert_eq!(shown(300, title), "shared-pick-and-plac..");
+        assert_eq!(shown(100, title), "");
+        assert_eq!(shown(10, title), "");
     }
 }

@@ -256,7 +256,6 @@ fn draw_bodies(step: &FilmStep, size: (usize, usize)) -> Raster {
 }
 
 fn write_captions(raster: &mut Raster, title: &str, step: &FilmStep, is_last: bool) {
-    caption::write(raster, (Corner::Left, 0), title, INK);
     let is_success = !step.achieved.is_empty() && step.achieved.iter().all(|achieved| *achieved);
     let time = format!("{:.2} s", step.scene.time_s);
     let (result, color) = match (is_success, is_last) {
@@ -264,6 +263,8 @@ fn write_captions(raster: &mut Raster, title: &str, step: &FilmStep, is_last: bo
         (false, true) => ("failure", BAD),
         (false, false) => ("", INK),
     };
+    let title = caption::beside(raster, title, time.chars().count());
+    caption::write(raster, (Corner::Left, 0), &title, INK);
     caption::write(raster, (Corner::Right, 0), &time, INK);
     caption::write(raster, (Corner::Right, 1), result, color);
 }
