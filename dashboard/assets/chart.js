@@ -24,10 +24,9 @@ const extremes = (values) => values.reduce(([low, high], it) => [Math.min(low, i
 
 function short(value) {
   const size = Math.abs(value);
-  if (size >= 1e6) return `${+(value / 1e6).toPrecision(3)} M`;
-  if (size >= 1e4) return `${+(value / 1e3).toPrecision(3)} k`;
-  if (size !== 0 && size < 1e-3) return value.toExponential(0).replace("-", "−");
-  return String(+value.toPrecision(3)).replace("-", "−");
+  const text = size >= 1e6 ? `${+(value / 1e6).toPrecision(3)} M` : size >= 1e4 ? `${+(value / 1e3).toPrecision(3)} k`
+    : size !== 0 && size < 1e-3 ? value.toExponential(0) : String(+value.toPrecision(3));
+  return text.replace("-", "−");
 }
 
 /**

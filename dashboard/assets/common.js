@@ -49,6 +49,7 @@ export function real(value) {
   if (!isNumber(value)) return "–";
   const size = Math.abs(value);
   if (size !== 0 && (size < 0.001 || size >= 1e6)) return value.toExponential(1).replace("-", "−");
+  if (size >= 1000) return count(value).replace("-", "−");
   const digits = size >= 100 ? 0 : size >= 10 ? 1 : size >= 1 ? 2 : 4;
   return value.toFixed(digits).replace("-", "−");
 }

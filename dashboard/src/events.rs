@@ -152,12 +152,18 @@ fn evaluation(row: &MetricsRow) -> String {
     let without_contact =
         row.contacts.success_without_contact.filter(|_| row.success_per_arm.len() > 1);
     let without_contact =
-        without_contact.map(|share| format!(", {:.1} % without contact", 100.0 * share));
-    let (round, success) = (row.round, 100.0 * row.success);
+        without_contact.map(|share| format!(", {} without contact", percent(share)));
     format!(
-        "Evaluation in round {round}: success {success:.1} %{}{best}",
+        "Evaluation in round {}: success {}{}{best}",
+        row.round,
+        percent(row.success),
         without_contact.unwrap_or_default()
     )
+}
+
+/// Formats a share as pages do: halves are rounded up.
+pub(crate) fn percent(share: f64) -> String {
+    format!("{:.1} %", (1000.0 * share).round() / 10.0)
 }
 
 /// Adds changes of the warning, of the teacher and of its ledger, and the end of the run.
@@ -304,8 +310,9 @@ mod tests {
             ContactMetrics { success_without_contact: Some(0.25), ..ContactMetrics::default() };
         let mut row = MetricsRow { success: 0.5, contacts, ..MetricsRow::default() };
         assert_eq!(evaluation(&row), "Evaluation in round 0: success 50.0 %", "of one arm");
-        row.success_per_arm = vec![0.5, 0.75];
-        let of_two = "Evaluation in round 0: success 50.0 %, 25.0 % without contact";
+        row.success_per_arm = vec![0.8125, 0.5];
+        row.success = 0.8125;
+        let of_two = "Evaluation in round 0: success 81.3 %, 25.0 % without contact";
         assert_eq!(evaluation(&row), of_two);
         let texts = events_of(&mut log, &mut view, |view| "no disk".clone_into(&mut view.warning));
         assert_eq!(texts, "No disk");

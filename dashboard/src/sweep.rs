@@ -8,7 +8,7 @@ use tandem_telemetry::MetricsRow;
 use tokio::sync::watch;
 
 use crate::document::encode;
-use crate::events::{Event, Level, Warnings, warnings};
+use crate::events::{Event, Level, Warnings, percent, warnings};
 use crate::page;
 use crate::site::{Frame, Site};
 
@@ -313,8 +313,8 @@ fn change(run: &SweepRunView) -> Option<(Level, String)> {
         SweepRunState::Running => (Level::Info, format!("{name} started")),
         SweepRunState::Finished => {
             let result = run.result.unwrap_or_default();
-            let success = 100.0 * result.success;
-            (Level::Good, format!("{name} is finished: success {success:.1} % on test goals"))
+            let success = percent(result.success);
+            (Level::Good, format!("{name} is finished: success {success} on test goals"))
         }
         SweepRunState::Failed => (Level::Bad, format!("{name} failed: {}", run.failure)),
         SweepRunState::Saved => (Level::Warning, format!("{name} is saved")),

@@ -197,8 +197,9 @@ def check_drawings(page):
       return cut.map(it => it.textContent);
     }))""")
     assert cut == [], cut
-    texts = page.value("import('/assets/common.js').then(({ count, percent }) => [count(-0.2), percent(0.5)])")
-    assert texts == ["0", "50.0\u00a0%"], texts
+    texts = page.value("import('/assets/common.js').then(({ count, percent, real }) => "
+                       "[count(-0.2), percent(0.5), real(-12345), real(-123), real(0.25)])")
+    assert texts == ["0", "50.0\u00a0%", "\u221212,345", "\u2212123", "0.2500"], texts
     for width in (360, 1280):
         page.resize(width, 900)
         cut = page.value(f"""import('/assets/player.js').then(({{ Player }}) => {{
