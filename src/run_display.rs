@@ -6,7 +6,7 @@ use std::time::Duration;
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use tandem_proto::pb;
 
-use crate::columns::wrapped;
+use crate::columns::{fitting, terminal_columns, wrapped};
 use crate::output;
 use crate::progress_text::{
     counts_line, evaluation_line, fraction_done, state_lines, warning_line,
@@ -17,6 +17,7 @@ const PLAIN_EVERY_S: f64 = 30.0;
 
 /// Live lines below the bar.
 const N_LINES: usize = 4;
+const INDENT: &str = "  ";
 
 pub(crate) struct Display {
     live: Option<Live>,
@@ -105,7 +106,7 @@ impl Live {
         bar.enable_steady_tick(Duration::from_millis(200));
         let lines = std::array::from_fn(|_| {
             let line = all.add(ProgressBar::new_spinner());
-            line.set_style(style("  {wide_msg}"));
+            line.set_style(style(&format!("{INDENT}{{wide_msg}}")));
             line
         });
         Self { all, bar, lines }
@@ -120,8 +121,9 @@ impl Live {
         self.bar.set_position((fraction_done(progress) * 1000.0) as u64);
         let texts = std::iter::once(counts_line(progress)).chain(state_lines(progress));
         let texts = texts.chain(std::iter::repeat(String::new()));
+        let n_columns = terminal_columns().saturating_sub(INDENT.len());
         for (line, text) in self.lines.iter().zip(texts) {
-            line.set_message(output::escaped(&text));
+            line.set_message(output::escaped(fitting(&text, n_columns)));
         }
     }
 }
