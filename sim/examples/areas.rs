@@ -51,7 +51,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     writeln!(
         picture,
-        "<text x=\"14\" y=\"24\">{task}: {N_STARTS} starts from above. Squares: objects, circles: goals,</text>\n\
+        "<rect width=\"100%\" height=\"54\" fill=\"white\"/>\n\
+         <text x=\"14\" y=\"24\">{task}: {N_STARTS} starts from above. Squares: objects, circles: goals,</text>\n\
          <text x=\"14\" y=\"44\">boxes: positions of the hands, arcs: reach of a Mico.</text>\n<line x1=\"14\" y1=\"{0:.0}\" x2=\"{1:.0}\" \
          y2=\"{0:.0}\" stroke=\"black\" stroke-width=\"3\"/>\n<text x=\"14\" y=\"{2:.0}\">10 cm</text>\n</svg>",
         height - 14.0,
