@@ -22,7 +22,7 @@ use tracing::warn;
 
 use crate::runtime::Runtime;
 use crate::shared::Clock;
-use crate::warnings::Warnings;
+use crate::warnings::{Source, Warnings};
 use audit::{Audit, Cost, Statement};
 use watcher::AccountWatcher;
 
@@ -186,12 +186,15 @@ impl AdviceAccount {
         };
         account.check_task(one_arm)?;
         match start {
-            RunStart::New => account.open_account(budget, 0)?,
+            RunStart::New => {
+                let found = account.open_account(budget, 0)?;
+                account.warn_if_used(found, warnings);
+            }
             // If the teacher lost the account meanwhile, it was opened again with what was left.
-            RunStart::Restarted => match account.balance()? {
-                Some(found) => account.open_account(found.budget.min(budget), 0)?,
-                None => account.open_account(budget, 0)?,
-            },
+            RunStart::Restarted => {
+                let found = account.balance()?.map_or(budget, |found| found.budget.min(budget));
+                account.open_account(found, 0)?;
+            }
             RunStart::Resumed { spent } => account.resume(spent)?,
         }
         let watcher = AccountWatcher::new(client, lost, (warnings.clone(), view), clock);
@@ -203,6 +206,21 @@ impl AdviceAccount {
             }
         });
         Ok(account)
+    }
+
+    /// Warns of an account that an earlier run has used: a new run gets the verdicts on the steps of the earlier one,
+    /// and the rest of its budget.
+    fn warn_if_used(&self, found: Statement, warnings: &Warnings) {
+        let Statement { spent, leased } = found;
+        if spent == 0 && leased == 0 {
+            return;
+        }
+        let name = &self.terms.name;
+        let warning = format!(
+            "the teacher's account {name:?} was used before, {spent} units are spent: a run of the same name decides on \
+             this run's advice, give this one another name"
+        );
+        warnings.set_first(Source::Advice, &warning);
     }
 
     /// Checks that the teacher advises on the task of one arm.
@@ -336,7 +354,7 @@ impl AdviceAccount {
                 );
                 self.terms.name = name;
                 self.full_budget = left;
-                self.open_account(left, spent)
+                self.open_account(left, spent).map(drop)
             }
             _ => self.open_or_reopen(spent),
         }
@@ -356,7 +374,7 @@ impl AdviceAccount {
                     let (got, asked) = (found.budget, self.terms.budget);
                     warn!(account = name, budget = got, asked, "continuing with a smaller account");
                 }
-                self.open_account(found.budget.min(self.terms.budget), spent)
+                self.open_account(found.budget.min(self.terms.budget), spent).map(drop)
             }
             Some(found) => {
                 let has = units_left(&found);
@@ -366,7 +384,7 @@ impl AdviceAccount {
             None => {
                 let budget = left.saturating_sub(written_off);
                 warn!(account = name, budget, "the teacher has lost the account, opening it again");
-                self.open_account(budget, spent)
+                self.open_account(budget, spent).map(drop)
             }
         }
     }
@@ -379,9 +397,9 @@ impl AdviceAccount {
         self.call_open_leases(&self.open_episodes).map(drop)
     }
 
-    /// Opens the account with `budget`, or finds it open, and restarts the audit. `learned` counts the units of the
-    /// episodes learned so far.
-    fn open_account(&mut self, budget: u64, learned: u64) -> Result<(), TeacherError> {
+    /// Opens the account with `budget`, or finds it open, restarts the audit and returns the account's state. `learned`
+    /// counts the units of the episodes learned so far.
+    fn open_account(&mut self, budget: u64, learned: u64) -> Result<Statement, TeacherError> {
         let terms = pb::OpenAccountRequest { budget, ..self.terms.clone() };
         let account = self.call("open the account", move |mut client| {
             let request = terms.clone();
@@ -391,8 +409,9 @@ impl AdviceAccount {
         AdviceAccountOpened { account: name, budget: *budget, spent: *spent, strategy }.emit();
         let may_spend = self.terms.budget.saturating_sub(learned);
         let ahead = may_spend.saturating_sub(units_left(&account));
-        self.audit = Audit::new(statement(&account), ahead, *budget == self.full_budget);
-        Ok(())
+        let found = statement(&account);
+        self.audit = Audit::new(found, ahead, *budget == self.full_budget);
+        Ok(found)
     }
 
     /// Returns the balance of the account; `None` if the teacher does not know it.

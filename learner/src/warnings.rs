@@ -12,7 +12,7 @@ use crate::progress::Progress;
 pub(crate) enum Source {
     /// Files that cannot be written.
     Disk,
-    /// Episodes that claim other charges than the teacher's account has.
+    /// An account that an earlier run has used, or episodes that claim other charges than the account has.
     Advice,
     /// Environments that do not repeat their episodes.
     Environment,

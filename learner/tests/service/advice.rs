@@ -8,6 +8,7 @@ use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, Task, TaskSpec};
 use tandem_learner::checkpoint;
 use tandem_learner::{Error, LearnerConfig};
+use tandem_proto::pb;
 use tandem_rl::RunConfig;
 use tokio::net::TcpListener;
 use tonic::Status;
@@ -242,6 +243,29 @@ async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
         again.shutdown.cancel();
         again.end().await.expect("resumed");
         assert_eq!(teacher.books().opened, expected);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_new_run_warns_of_an_account_that_a_run_of_the_same_name_has_used() {
+    let (_, teacher) = calm(advised(0, AMPLE)).await;
+    let address = teacher.serve().await;
+    let directory = tempfile::tempdir().expect("a directory");
+    for (resume, expected) in [
+        (false, "the teacher's account \"toy\" was used before, 252 units are spent: "),
+        // A run that ended before its first checkpoint has used the account itself.
+        (true, ""),
+    ] {
+        let run = advised(0, AMPLE);
+        let served = Served::start(with_teacher(run, directory.path(), resume, address)).await;
+        let mut toy = served.join("toy").await;
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
+        let warning = progress.into_inner().warning;
+        assert_eq!(warning.is_empty(), expected.is_empty(), "{warning}");
+        assert!(warning.starts_with(expected), "{warning}");
+        served.shutdown.cancel();
+        served.end().await.expect("stopped");
+        std::fs::remove_dir_all(directory.path().join("checkpoint")).expect("saved");
     }
 }
 
