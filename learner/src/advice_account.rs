@@ -184,7 +184,7 @@ impl AdviceAccount {
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
-        account.check_task(one_arm)?;
+        let policy = account.check_task(one_arm)?;
         match start {
             RunStart::New => {
                 let found = account.open_account(budget, 0)?;
@@ -197,7 +197,7 @@ impl AdviceAccount {
             }
             RunStart::Resumed { spent } => account.resume(spent)?,
         }
-        let watcher = AccountWatcher::new(client, lost, (warnings.clone(), view), clock);
+        let watcher = AccountWatcher::new((client, policy), lost, (warnings.clone(), view), clock);
         let watch = watcher.watch(account.terms.name.clone());
         runtime.spawn(async move {
             tokio::select! {
@@ -217,14 +217,14 @@ impl AdviceAccount {
         }
         let name = &self.terms.name;
         let warning = format!(
-            "the teacher's account {name:?} was used before, {spent} units are spent: a run of the same name decides on \
-             this run's advice, give this one another name"
+            "the teacher's account {name:?} was used before, {spent} units are spent: a run of the same name decides \
+             on this run's advice, give this one another name"
         );
         warnings.set_first(Source::Advice, &warning);
     }
 
-    /// Checks that the teacher advises on the task of one arm.
-    fn check_task(&self, one_arm: &TaskSpec) -> Result<(), TeacherError> {
+    /// Checks that the teacher advises on the task of one arm, and returns the digest of its policy.
+    fn check_task(&self, one_arm: &TaskSpec) -> Result<String, TeacherError> {
         let described = self.call("describe its task", |mut client| async move {
             client.describe(pb::DescribeRequest {}).await
         })?;
@@ -240,7 +240,7 @@ impl AdviceAccount {
         };
         match task.map_or_else(|| Some(name_differs()), |task| one_arm.difference(&task)) {
             Some(difference) => Err(TeacherError::OtherTask(difference)),
-            None => Ok(()),
+            None => Ok(described.policy_digest),
         }
     }
 

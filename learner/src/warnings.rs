@@ -20,6 +20,8 @@ pub(crate) enum Source {
     Failures,
     /// A statistic of the normalisers is out of all proportion.
     Statistics,
+    /// The teacher advises by another policy than before.
+    Policy,
     /// The teacher.
     Teacher,
 }

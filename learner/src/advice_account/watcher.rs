@@ -22,10 +22,14 @@ const CHECK_PERIOD: Duration = Duration::from_secs(1);
 const WARN_AFTER: Duration = Duration::from_secs(5);
 /// Largest number of characters of an error in the warning.
 const MAX_ERROR_CHARS: usize = 200;
+/// Number of characters of a policy's digest in the warning.
+const N_DIGEST_CHARS: usize = 12;
 
 /// Asks for the account about once a second.
 pub(super) struct AccountWatcher {
     client: TeacherClient<AuthChannel>,
+    /// The digest of the teacher's policy when the account was opened.
+    policy: String,
     /// Set when the teacher reports that it does not know the account.
     lost: Arc<AtomicBool>,
     status: TeacherStatus,
@@ -33,14 +37,14 @@ pub(super) struct AccountWatcher {
 
 impl AccountWatcher {
     pub(super) fn new(
-        client: TeacherClient<AuthChannel>,
+        (client, policy): (TeacherClient<AuthChannel>, String),
         lost: Arc<AtomicBool>,
         (warnings, view): (Warnings, watch::Sender<TeacherView>),
         clock: Clock,
     ) -> Self {
         let answered_at = clock();
         let status = TeacherStatus { warnings, view, clock, answered_at, is_warned: false };
-        Self { client, lost, status }
+        Self { client, policy, lost, status }
     }
 
     pub(super) async fn watch(mut self, name: String) {
@@ -48,10 +52,31 @@ impl AccountWatcher {
             tokio::time::sleep(CHECK_PERIOD).await;
             let look = self.client.get_account(pb::GetAccountRequest { name: name.clone() });
             let answer = within(CALL_DEADLINE, look).await.map(tonic::Response::into_inner);
-            if self.status.record(answer) == TeacherState::Lost {
-                self.lost.store(true, Ordering::Relaxed);
+            match self.status.record(answer) {
+                TeacherState::Lost => self.lost.store(true, Ordering::Relaxed),
+                TeacherState::Answering => self.check_policy().await,
+                TeacherState::None | TeacherState::Unreachable => {}
             }
         }
+    }
+
+    /// Warns if the teacher was restarted with another policy, perhaps for another task: requests for advice do not
+    /// name the policy.
+    async fn check_policy(&mut self) {
+        let look = self.client.describe(pb::DescribeRequest {});
+        let Ok(described) = within(CALL_DEADLINE, look).await else { return };
+        let (now, first) = (described.into_inner().policy_digest, &self.policy);
+        if now == *first {
+            return;
+        }
+        let shown = |digest: &str| digest.chars().take(N_DIGEST_CHARS).collect::<String>();
+        let warning = format!(
+            "the teacher was restarted with another policy, {} instead of {}, and advises differently: restart it with \
+             the first one",
+            shown(&now),
+            shown(first)
+        );
+        self.status.warnings.set_first(Source::Policy, &warning);
     }
 }
 

@@ -13,7 +13,7 @@ use tandem_rl::RunConfig;
 use tokio::net::TcpListener;
 use tonic::Status;
 
-use crate::service_tests::run::{Left, Served, Toy, learner_config};
+use crate::service_tests::run::{DEADLINE, Left, Served, Toy, learner_config};
 use crate::service_tests::teacher::FakeTeacher;
 use crate::service_tests::toy::{UNITS, claim, config};
 
@@ -267,6 +267,38 @@ async fn a_new_run_warns_of_an_account_that_a_run_of_the_same_name_has_used() {
         served.end().await.expect("stopped");
         std::fs::remove_dir_all(directory.path().join("checkpoint")).expect("saved");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_teacher_restarted_with_another_policy_is_warned_of() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    teacher.books().policy_digest = "5f3a".repeat(16);
+    let address = teacher.serve().await;
+    let run = advised(0, AMPLE);
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    let mut warning = async || {
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
+        progress.into_inner().warning
+    };
+    tokio::time::sleep(Duration::from_millis(1500)).await;
+    assert_eq!(warning().await, "", "the same policy");
+    teacher.books().policy_digest = "0b1c".repeat(16);
+    let warned = async {
+        loop {
+            match warning().await {
+                text if text.is_empty() => tokio::time::sleep(Duration::from_millis(20)).await,
+                text => break text,
+            }
+        }
+    };
+    let text = tokio::time::timeout(DEADLINE, warned).await.expect("there is a warning");
+    let expected =
+        "the teacher was restarted with another policy, 0b1c0b1c0b1c instead of 5f3a5f3a5f3a, ";
+    assert!(text.starts_with(expected), "{text}");
+    served.shutdown.cancel();
+    served.end().await.expect("stopped");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

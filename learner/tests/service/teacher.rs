@@ -30,6 +30,8 @@ pub(crate) struct Books {
     pub(crate) charged_ever: u64,
     /// The teacher's task, unless it is that of the toy.
     pub(crate) task: Option<TaskSpec>,
+    /// The digest of the teacher's policy.
+    pub(crate) policy_digest: String,
     /// Every account that was opened, with its budget.
     pub(crate) opened: Vec<(String, u64)>,
 }
@@ -193,7 +195,12 @@ impl Teacher for FakeTeacher {
     ) -> Result<Response<pb::DescribeResponse>, Status> {
         let task = self.books().task.clone().unwrap_or_else(|| LAYOUT.into());
         let task_description = Some(encode_task(&task));
-        Ok(Response::new(pb::DescribeResponse { task_description, ..Default::default() }))
+        let policy_digest = self.books().policy_digest.clone();
+        Ok(Response::new(pb::DescribeResponse {
+            task_description,
+            policy_digest,
+            ..Default::default()
+        }))
     }
 
     async fn advise(
