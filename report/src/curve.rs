@@ -341,7 +341,10 @@ fn y_range(series: &[Series], percent: bool) -> std::ops::Range<f64> {
     if percent {
         return 0.0..1.0;
     }
-    let values = || series.iter().flat_map(|one| &one.points).map(|point| point.y);
+    // The plotting library never returns from a range whose length is not finite.
+    const LARGEST: f64 = f64::MAX / 8.0;
+    let points = || series.iter().flat_map(|one| &one.points);
+    let values = || points().map(|point| point.y.clamp(-LARGEST, LARGEST));
     let (low, high) = (values().fold(0.0, f64::min), values().fold(0.0, f64::max));
     let room = 0.06 * (high - low);
     match high > low {
@@ -423,5 +426,7 @@ mod tests {
         let range = y_range(&[series(&[-8.0, -2.0])], false);
         assert!(range.start < -8.0 && range.end == 0.0, "{range:?}");
         assert_eq!(y_range(&[series(&[])], false), 0.0..1.0);
+        let range = y_range(&[series(&[-f64::MAX, f64::MAX])], false);
+        assert!((range.end - range.start).is_finite(), "{range:?}");
     }
 }
