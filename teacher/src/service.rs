@@ -2,6 +2,7 @@
 
 mod advice;
 mod convert;
+mod failures;
 mod metrics;
 mod thread;
 
@@ -126,7 +127,9 @@ impl Teacher for TeacherService {
         request: Request<pb::OpenAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
         let request = request.into_inner();
-        let account = open_account(&self.advisor, request).await.map_err(|error| status(&error))?;
+        let account = open_account(&self.advisor, request)
+            .await
+            .map_err(|error| refused(&self.advisor, &error))?;
         Ok(Response::new(account))
     }
 
@@ -135,7 +138,7 @@ impl Teacher for TeacherService {
         request: Request<pb::GetAccountRequest>,
     ) -> Result<Response<pb::Account>, Status> {
         let account = get_account(&self.advisor, request.into_inner()).await;
-        let account = account.map_err(|error| status(&error))?;
+        let account = account.map_err(|error| refused(&self.advisor, &error))?;
         Ok(Response::new(account))
     }
 
@@ -159,7 +162,7 @@ impl Teacher for TeacherService {
         request: Request<pb::OpenLeasesRequest>,
     ) -> Result<Response<pb::OpenLeasesResponse>, Status> {
         let leases = open_leases(&self.advisor, request.into_inner()).await;
-        let leases = leases.map_err(|error| status(&error))?;
+        let leases = leases.map_err(|error| refused(&self.advisor, &error))?;
         Ok(Response::new(leases))
     }
 
@@ -168,7 +171,7 @@ impl Teacher for TeacherService {
         request: Request<pb::SettleLeasesRequest>,
     ) -> Result<Response<pb::Account>, Status> {
         let account = settle_leases(&self.advisor, request.into_inner()).await;
-        let account = account.map_err(|error| status(&error))?;
+        let account = account.map_err(|error| refused(&self.advisor, &error))?;
         Ok(Response::new(account))
     }
 }
@@ -227,6 +230,12 @@ async fn settle_leases(
     Ok(encode_balance(name, &balance))
 }
 
+/// Logs a failure, and maps an error to the status that the client receives.
+fn refused(advisor: &AdvisorHandle, error: &Error) -> Status {
+    advisor.record_failure(error);
+    status(error)
+}
+
 /// Maps an error to the status that the client receives.
 fn status(error: &Error) -> Status {
     let message = error.to_string();
@@ -243,17 +252,11 @@ fn status(error: &Error) -> Status {
         Error::Ledger(LedgerError::Budget(BudgetError::OtherTerms { .. })) => {
             Status::already_exists(message)
         }
-        Error::RemotePolicy(RemoteError::Changed { .. }) => {
-            tracing::error!(%error, "request refused");
-            Status::failed_precondition(message)
-        }
+        Error::RemotePolicy(RemoteError::Changed { .. }) => Status::failed_precondition(message),
         Error::Ledger(LedgerError::Unavailable { .. })
         | Error::LedgerNeedsRestart
         | Error::Timeout(_)
-        | Error::RemotePolicy(RemoteError::Unavailable { .. }) => {
-            tracing::error!(%error, "request failed");
-            Status::unavailable(message)
-        }
+        | Error::RemotePolicy(RemoteError::Unavailable { .. }) => Status::unavailable(message),
         Error::Policy(_)
         | Error::Onnx(_)
         | Error::SurplusCritic
@@ -266,10 +269,7 @@ fn status(error: &Error) -> Status {
         | Error::Panicked
         | Error::Thread(_)
         | Error::ServerConfig(_)
-        | Error::Transport(_) => {
-            tracing::error!(%error, "request failed");
-            Status::internal(message)
-        }
+        | Error::Transport(_) => Status::internal(message),
     }
 }
 

@@ -11,7 +11,7 @@ use tonic::{Status, Streaming};
 use tracing::{Instrument as _, Span};
 
 use super::convert::decode_queries;
-use super::status;
+use super::refused;
 use super::thread::AdvisorHandle;
 use crate::advisor::{Advice, AdviceRequest};
 use crate::error::Error;
@@ -27,9 +27,10 @@ pub(super) async fn advise(
 ) -> Result<pb::AdviseResponse, Status> {
     let span = span_of(&request);
     let answer = async {
-        let request = decode(advisor, request).map_err(|error| status(&error))?;
+        let refused = |error| refused(advisor, &error);
+        let request = decode(advisor, request).map_err(refused)?;
         let advice = advisor.advise(request).await;
-        advice.map(|advice| encode(&advice)).map_err(|error| status(&error))
+        advice.map(|advice| encode(&advice)).map_err(refused)
     };
     answer.instrument(span).await
 }

@@ -399,3 +399,38 @@ async fn a_panic_is_an_internal_error_and_ends_the_service() {
     drop((client, channel, sender, answers));
     assert!(matches!(served.await.unwrap(), Err(Error::Panicked)));
 }
+
+/// A writer into memory that tests read as the log.
+#[derive(Clone, Default)]
+struct Log(std::sync::Arc<std::sync::Mutex<Vec<u8>>>);
+
+impl std::io::Write for Log {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[tokio::test]
+async fn many_failures_for_one_reason_are_one_line_of_the_log() {
+    let log = Log::default();
+    let to = log.clone();
+    let subscriber =
+        tracing_subscriber::fmt().with_ansi(false).with_writer(move || to.clone()).finish();
+    let logged = tracing::subscriber::set_default(subscriber);
+    let mut fixture = Fixture::start().await;
+    fixture.open(10, "ea").await.unwrap();
+    fixture.gate.set(Mode::Refuse);
+    for _ in 0..20 {
+        assert_eq!(refusal(fixture.advise(vec![step(0)]).await).0, Code::Unavailable);
+    }
+    fixture.stop().await;
+    drop(logged);
+    let text = String::from_utf8(log.0.lock().unwrap().clone()).unwrap();
+    let lines: Vec<&str> = text.lines().filter(|line| line.contains("request failed")).collect();
+    assert!(lines.len() == 1 && lines[0].contains("the disk is full"), "{text}");
+}

@@ -12,6 +12,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::advisor::{Advice, AdviceRequest, Advisor, TeacherInfo};
 use crate::error::Error;
+use crate::service::failures::FailureLog;
 use crate::service::metrics::TeacherMetrics;
 
 /// The capacity of the job queue. When it is full, calls wait to enqueue their jobs.
@@ -48,6 +49,7 @@ pub(super) struct AdvisorHandle {
     jobs: mpsc::Sender<Job>,
     timeout: Duration,
     metrics: TeacherMetrics,
+    failures: Arc<FailureLog>,
 }
 
 /// Signals the end of the thread when it is dropped, also after a panic.
@@ -84,7 +86,8 @@ impl AdvisorThread {
                 run_task(advisor, queue, batch, &stop).await
             })),
         };
-        Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout, metrics }))
+        let failures = Arc::default();
+        Ok((Self { handle, ended }, AdvisorHandle { info, jobs, timeout, metrics, failures }))
     }
 
     /// Waits up to `grace` for the end of the thread. A thread that is still busy then is detached.
@@ -109,6 +112,11 @@ impl AdvisorHandle {
     /// Returns the description of the teacher.
     pub(super) fn info(&self) -> &TeacherInfo {
         &self.info
+    }
+
+    /// Logs the failure of a request, unless many requests have failed alike.
+    pub(super) fn record_failure(&self, error: &Error) {
+        self.failures.record(error, self.metrics.metrics.now());
     }
 
     /// Answers a request for advice. If the future is dropped before the thread has taken the request, nothing is
