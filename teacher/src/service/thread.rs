@@ -19,13 +19,16 @@ use crate::service::metrics::TeacherMetrics;
 const QUEUE_CAPACITY: usize = 256;
 /// The number of steps at which a batch takes no further request.
 const MAX_BATCH_STEPS: usize = 256;
+/// The part of the time limit of a call that a batch is to take at most. Fewer requests are answered together if the
+/// policy is slow.
+const MAX_BATCH_SHARE: f64 = 0.25;
 
 type Answer<T> = Result<T, Error>;
 
 /// A job for the thread.
 enum Job {
-    /// Answer a request for advice, in a batch with others.
-    Advise(AdviceRequest, oneshot::Sender<Answer<Advice>>),
+    /// Answer a request for advice, which has waited since this time, in a batch with others.
+    Advise(AdviceRequest, Duration, oneshot::Sender<Answer<Advice>>),
     /// Run any other operation.
     Run(Box<dyn FnOnce(&mut Advisor) + Send>),
 }
@@ -70,7 +73,7 @@ impl AdvisorThread {
     ) -> io::Result<(Self, AdvisorHandle)> {
         let (jobs, queue) = mpsc::channel(QUEUE_CAPACITY);
         add_queue_depth(&metrics, &jobs);
-        let batch = Batch::new(metrics.clone());
+        let batch = Batch::new(metrics.clone(), timeout);
         let (end_sender, ended) = oneshot::channel();
         let info = Arc::new(advisor.info().clone());
         let end_signal = EndSignal { _stop: stop.clone().drop_guard(), _ended: end_sender };
@@ -124,7 +127,7 @@ impl AdvisorHandle {
     pub(super) async fn advise(&self, request: AdviceRequest) -> Answer<Advice> {
         let (reply, answer) = oneshot::channel();
         let start = self.metrics.metrics.now();
-        let advice = self.send(Job::Advise(request, reply), answer).await;
+        let advice = self.send(Job::Advise(request, start, reply), answer).await;
         self.metrics.record_request(start);
         advice
     }
@@ -208,29 +211,79 @@ struct Batch {
     requests: Vec<AdviceRequest>,
     replies: Vec<oneshot::Sender<Answer<Advice>>>,
     n_steps: usize,
+    pace: Pace,
+    /// The time limit of a call.
+    timeout: Duration,
     metrics: TeacherMetrics,
 }
 
+/// What the latest batch says about the next one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Pace {
+    /// The number of steps at which a batch takes no further request.
+    max_steps: usize,
+    /// The time that a batch takes.
+    batch_time: Duration,
+}
+
+impl Pace {
+    /// As long as nothing is known.
+    const FAST: Self = Self { max_steps: MAX_BATCH_STEPS, batch_time: Duration::ZERO };
+
+    /// Returns the pace after a batch of `n_steps` steps, at least 1, has taken `time`; a call may take `timeout`.
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "clamped to a small positive range"
+    )]
+    fn after(n_steps: usize, time: Duration, timeout: Duration) -> Self {
+        let max_time_s = MAX_BATCH_SHARE * timeout.as_secs_f64();
+        let affordable = n_steps as f64 * max_time_s / time.as_secs_f64();
+        let max_steps = affordable.clamp(1.0, MAX_BATCH_STEPS as f64) as usize;
+        Self { max_steps, batch_time: time }
+    }
+
+    /// Returns whether a request that has waited for `waited` is not worth an answer: its caller would be gone before
+    /// the batch ends. Some requests are always worth one, so that the pace is measured again.
+    fn is_too_late(self, waited: Duration, timeout: Duration) -> bool {
+        waited + self.batch_time.min(timeout / 2) > timeout
+    }
+}
+
 impl Batch {
-    const fn new(metrics: TeacherMetrics) -> Self {
-        Self { requests: Vec::new(), replies: Vec::new(), n_steps: 0, metrics }
+    const fn new(metrics: TeacherMetrics, timeout: Duration) -> Self {
+        Self {
+            requests: Vec::new(),
+            replies: Vec::new(),
+            n_steps: 0,
+            pace: Pace::FAST,
+            timeout,
+            metrics,
+        }
     }
 
     /// Takes `job` and the jobs behind it until the batch is full or the queue is empty.
     fn take_all(&mut self, job: Job, jobs: &mut mpsc::Receiver<Job>, advisor: &mut Advisor) {
         self.take(job, advisor);
-        while self.n_steps < MAX_BATCH_STEPS
+        while self.n_steps < self.pace.max_steps
             && let Ok(job) = jobs.try_recv()
         {
             self.take(job, advisor);
         }
     }
 
-    /// Adds a request, unless its caller has gone. Any other job runs after the requests before it are answered.
+    /// Adds a request, unless its caller has gone or will be gone. Any other job runs after the requests before it are
+    /// answered.
     fn take(&mut self, job: Job, advisor: &mut Advisor) {
         match job {
-            Job::Advise(_, reply) if reply.is_closed() => {}
-            Job::Advise(request, reply) => {
+            Job::Advise(_, _, reply) if reply.is_closed() => {}
+            Job::Advise(request, since, reply) => {
+                let waited = self.metrics.metrics.now().saturating_sub(since);
+                if self.pace.is_too_late(waited, self.timeout) {
+                    // A caller that has gone repeats its request anyway.
+                    drop(reply.send(Err(Error::Timeout(self.timeout))));
+                    return;
+                }
                 self.n_steps += request.queries.len();
                 self.requests.push(request);
                 self.replies.push(reply);
@@ -248,6 +301,10 @@ impl Batch {
         }
         let start = self.metrics.metrics.now();
         let answers = advisor.advise(&self.requests);
+        if self.n_steps > 0 {
+            let time = self.metrics.metrics.now().saturating_sub(start);
+            self.pace = Pace::after(self.n_steps, time, self.timeout);
+        }
         self.metrics.record_batch(start, self.n_steps, &answers);
         self.requests.clear();
         self.n_steps = 0;

@@ -2,13 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use tandem_core::StepAdvice;
+use tandem_core::{StepAdvice, TaskSpec};
 use tandem_net::Metrics;
 use tokio::task::JoinHandle as Task;
 
 use super::*;
 use crate::budget::{AccountTerms, Balance};
 use crate::fake::{FakePolicy, query};
+use crate::ledger::MemoryLedger;
+use crate::policy::TeacherPolicy;
 use crate::service::gated_ledger::{GateControl, GatedLedger, Mode, eventually};
 
 /// A timeout that no test reaches.
@@ -266,4 +268,84 @@ async fn a_blocked_thread_is_detached() {
     gate.set(Mode::Answer);
     assert!(advice(first).await.charged);
     stop.cancelled().await;
+}
+
+#[test]
+fn a_slow_policy_gets_small_batches_and_no_request_whose_caller_would_be_gone() {
+    let secs = Duration::from_secs_f64;
+    let timeout = secs(4.0);
+    let max_steps = |n_steps, time_s| Pace::after(n_steps, secs(time_s), timeout).max_steps;
+    assert_eq!(max_steps(2, 0.0), MAX_BATCH_STEPS, "the clock of a simulation");
+    assert_eq!(max_steps(2, 0.000_1), MAX_BATCH_STEPS);
+    assert_eq!([max_steps(16, 3.0), max_steps(2, 0.8), max_steps(2, 9.0)], [5, 2, 1]);
+    let is_too_late = |time_s, waited_s| {
+        Pace::after(2, secs(time_s), timeout).is_too_late(secs(waited_s), timeout)
+    };
+    assert_eq!([is_too_late(0.8, 3.1), is_too_late(0.8, 3.3)], [false, true]);
+    assert!(!is_too_late(60.0, 1.9), "the pace is measured again after a disk has hung");
+    assert!(!Pace::FAST.is_too_late(timeout, timeout));
+}
+
+#[tokio::test]
+async fn a_policy_too_slow_for_all_callers_at_once_answers_some_of_them() {
+    const N_CALLERS: u64 = 16;
+    let (step_time, timeout) = (Duration::from_millis(10), Duration::from_millis(300));
+    let start = tokio::time::Instant::now();
+    let metrics = TeacherMetrics::register(&Metrics::new(Arc::new(move || start.elapsed())));
+    let policy = Box::new(SlowPolicy { step_time });
+    let mut advisor = Advisor::new(policy, Box::<MemoryLedger>::default()).unwrap();
+    let terms = AccountTerms { budget: 1000, strategy: "ea".parse().unwrap() };
+    advisor.open_account("run", terms).unwrap();
+    let stop = CancellationToken::new();
+    let (thread, handle) =
+        AdvisorThread::spawn(advisor, timeout, stop, Pacing::Concurrent, metrics).unwrap();
+    let end = start + Duration::from_secs(2);
+    let callers: Vec<Task<u32>> = (0..N_CALLERS)
+        .map(|episode| {
+            let handle = handle.clone();
+            tokio::spawn(async move {
+                let mut n_answered = 0;
+                while tokio::time::Instant::now() < end {
+                    match handle.advise(request(episode, n_answered)).await {
+                        Ok(_) => n_answered += 1,
+                        Err(_) => tokio::time::sleep(Duration::from_millis(5)).await,
+                    }
+                }
+                n_answered
+            })
+        })
+        .collect();
+    let mut n_answered = 0;
+    for caller in callers {
+        n_answered += caller.await.unwrap();
+    }
+    drop(handle);
+    thread.join(LONG).await.unwrap();
+    // There is time for 100 answers. A batch of all callers takes longer than they wait.
+    assert!(n_answered > 20, "{n_answered}");
+}
+
+/// A policy that takes a while for each state.
+struct SlowPolicy {
+    step_time: Duration,
+}
+
+impl TeacherPolicy for SlowPolicy {
+    fn layout(&self) -> TaskSpec {
+        FakePolicy.layout()
+    }
+
+    fn digest(&self) -> &str {
+        "slow"
+    }
+
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        let n_states = u32::try_from(goals.len() / 3).unwrap();
+        thread::sleep(self.step_time * n_states);
+        FakePolicy.act(observations, goals, actions);
+    }
+
+    fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
+        FakePolicy.q(observations, goals, actions, q);
+    }
 }
