@@ -50,7 +50,7 @@ mod tests {
         assert_eq!(fitting(text, 60), "00:06 8,000 of 100,000 env steps (1209/s), 400 updates");
         assert_eq!(fitting(text, 40), "00:06 8,000 of 100,000 env steps");
         assert_eq!(fitting(text, 20), text);
-        assert_eq!(fitting("best success –; training success 0.19", 16), "best success –");
+        assert_eq!(fitting("best success –; training 0.19", 16), "best success –");
     }
 
     #[test]

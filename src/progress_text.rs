@@ -55,7 +55,7 @@ pub(crate) fn fraction_done(progress: &pb::Progress) -> f64 {
 
 /// Returns the result of an evaluation.
 pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluation) -> String {
-    let without_contact = evaluation.success_without_contact.filter(|_| progress.n_arms > 1);
+    let without_contact = success_without_contact(progress, evaluation);
     let without_contact = without_contact.map(|share| format!(", {share:.3} without contact"));
     format!(
         "{} {} env steps: success {:.3} [{:.3}, {:.3}]{}",
@@ -68,14 +68,25 @@ pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluati
     )
 }
 
+/// Returns the share of episodes that succeed without contact, by which the best policy of several arms is selected.
+fn success_without_contact(progress: &pb::Progress, evaluation: &pb::Evaluation) -> Option<f64> {
+    evaluation.success_without_contact.filter(|_| progress.n_arms > 1)
+}
+
 /// Returns the state of a run: its best evaluation, advice and processes.
 pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
-    let best = progress.best.as_ref().map_or_else(
-        || "none yet".to_owned(),
-        |best| format!("{:.3} at {} env steps", best.success, grouped(best.env_steps)),
-    );
-    let mut lines =
-        vec![format!("best success {best}; training success {:.2}", progress.training_success)];
+    let best = match &progress.best {
+        Some(best) => {
+            let without_contact = success_without_contact(progress, best);
+            let without_contact =
+                without_contact.map(|share| format!(" ({share:.3} without contact)"));
+            let (without_contact, env_steps) =
+                (without_contact.unwrap_or_default(), grouped(best.env_steps));
+            format!("{:.3}{without_contact} at {env_steps} env steps", best.success)
+        }
+        None => "none yet".to_owned(),
+    };
+    let mut lines = vec![format!("best success {best}; training {:.2}", progress.training_success)];
     lines.extend(advice_text(progress).map(|advice| format!("advice {advice}")));
     if !progress.phase.is_empty() {
         lines.push(format!("learner {}; {}", progress.phase, workers_text(progress)));
@@ -195,7 +206,7 @@ mod tests {
         let expected = [
             "1:06:40 299,200 of 300,000 env steps (236/s), 149,600 updates, 00:03 left",
             "1:06:40 299,200 env steps: success 0.958 [0.925, 0.977], 0.900 without contact",
-            "best success 0.958 at 299,200 env steps; training success 0.00",
+            "best success 0.958 (0.900 without contact) at 299,200 env steps; training 0.00",
             "advice 4,301 spent, 495,699 left",
             "learner collecting; no workers",
         ];

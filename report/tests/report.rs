@@ -150,7 +150,11 @@ fn the_page_of_one_arm_without_advice_has_nothing_about_either() {
     assert!(page.contains("tabindex=0 role=region aria-label=\"Evaluations\""));
     std::fs::write(dir.path().join("run.toml"), "task = \"push\"\narms = 2\n").unwrap();
     let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
-    assert_eq!(page.matches("without arm contact").count(), 2, "a tile and a column");
+    assert_eq!(
+        page.matches("without arm contact").count(),
+        4,
+        "a tile, a column, and the legend in two sizes"
+    );
 }
 
 #[test]

@@ -172,12 +172,17 @@ fn curves(run: &Run, task: Option<&TaskSpec>) -> Result<Vec<Drawing>, Error> {
     };
     let is_built_in = task.is_none_or(|task| task.as_built_in().is_some());
     let moved = if is_built_in { "object moved" } else { "achieved goal moved" };
-    let success = series(&[
+    let mut shares = vec![
         ("success", Quantity::Success),
         ("joint goal", Quantity::SuccessJoint),
         ("training episodes", Quantity::TrainingSuccess),
         (moved, Quantity::Moved),
-    ]);
+    ];
+    let is_known = |row: &MetricsRow| row.contacts.success_without_contact.is_some();
+    if has_several_arms(task) && run.rows.iter().any(is_known) {
+        shares.insert(1, (WITHOUT_ARM_CONTACT, Quantity::SuccessWithoutContact));
+    }
+    let success = series(&shares);
     let contacts = series(&[
         ("any", Quantity::CollisionRate),
         ("before success", Quantity::CollisionRateBeforeSuccess),
