@@ -65,9 +65,11 @@ def sweep(arguments: list[str]) -> list[str]:
     for key in ("tasks", "seeds", "variant"):
         if key in sweep:
             sweep[key] = sweep[key][:1]
-    if "teachers" in sweep and "tasks" in sweep:
-        # A teacher of a task that is left out is refused.
-        sweep["teachers"] = {task: path for task, path in sweep["teachers"].items() if task in sweep["tasks"]}
+    # Teachers and settings of a task that is left out are refused.
+    for key in {"teachers", "per_task"} & sweep.keys():
+        sweep[key] = {task: of_task for task, of_task in sweep[key].items() if task in sweep.get("tasks", [task])}
+    for settings in sweep.get("per_task", {}).values():
+        settings.pop("stop", None)
     if "strategies" in sweep:
         sweep["strategies"] = sweep["strategies"][-1:]
     for axis in sweep.get("axis", []):
