@@ -2,6 +2,7 @@
 
 use tandem_core::layout::{Layout, OBSERVATION_PER_ARM, Task};
 use tandem_core::rng::{Stream, episode_rng, uniform};
+use tandem_core::scene::Scene;
 use tandem_core::work::{EpisodeExploration, EpisodeOrder, EpisodeStart, RunTerms, SlotOrder};
 use tandem_core::{
     AdviceTerms, ArmAdvice, Contacts, EpisodeKind, Exploration, StepAdvice, StepQuery,
@@ -78,6 +79,10 @@ impl Environment for FakeEnvironment {
         }
         self.observe(observations);
         Ok(())
+    }
+
+    fn scene(&self, _environment: usize) -> Option<Scene> {
+        None
     }
 }
 

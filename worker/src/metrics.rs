@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use tandem_core::scene::Scene;
 use tandem_core::work::EpisodeStart;
 use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_net::Metrics;
@@ -96,6 +97,10 @@ impl<E: Environment> Environment for Measured<'_, &mut E> {
     fn avoidance_steps(&self, environment: usize) -> Option<u32> {
         self.port.avoidance_steps(environment)
     }
+
+    fn scene(&self, environment: usize) -> Option<Scene> {
+        self.port.scene(environment)
+    }
 }
 
 impl<A: Advisor> Advisor for Measured<'_, &mut A> {
@@ -108,5 +113,34 @@ impl<A: Advisor> Advisor for Measured<'_, &mut A> {
 
     fn budget_left(&self) -> Option<u64> {
         self.port.budget_left()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{EpisodeKind, Layout, Task, WorldSettings};
+    use tandem_sim::{Env, WorldConfig};
+
+    use super::*;
+    use crate::ports::Simulator;
+
+    #[test]
+    fn a_measured_simulator_has_the_scenes_of_the_simulator() {
+        let layout = Layout::new(Task::Push, 2);
+        let env = Env::new(layout, &WorldConfig::default()).unwrap();
+        let mut simulator = Simulator::new(env);
+        let metrics = WorkerMetrics::register(&Metrics::default());
+        let mut measured = Measured { port: &mut simulator, metrics: &metrics };
+        let start = EpisodeStart {
+            seed: 1,
+            number: 0,
+            kind: EpisodeKind::Training,
+            world: WorldSettings::default(),
+        };
+        let (mut observation, mut goal) = (vec![0.0; 56], vec![0.0; 6]);
+        measured.reset(&[start], &mut observation, &mut goal).unwrap();
+        let scene = measured.scene(0).unwrap();
+        assert_eq!(scene.arms.len(), 2);
+        assert_eq!(Some(scene), simulator.scene(0));
     }
 }

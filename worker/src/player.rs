@@ -1,5 +1,6 @@
 //! The state that a worker keeps between slots: a world, the latest actor and the directory for logs.
 
+use tandem_core::scene::Scene;
 use tandem_core::work::{EpisodeOrder, EpisodeStart, PublishedActor, RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, StepAdvice, StepQuery};
 use tandem_policy::{Actor, actor_digest, symmetrized_actor};
@@ -275,5 +276,9 @@ impl Environment for PeerChannel {
         observations.copy_from_slice(&reply.observations);
         contacts.copy_from_slice(&reply.contacts);
         Ok(())
+    }
+
+    fn scene(&self, _environment: usize) -> Option<Scene> {
+        None
     }
 }

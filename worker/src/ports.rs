@@ -86,9 +86,7 @@ pub trait Environment {
     }
 
     /// Returns the bodies of environment `environment`, from 0, at this moment; `None` if they are unknown.
-    fn scene(&self, _environment: usize) -> Option<Scene> {
-        None
-    }
+    fn scene(&self, environment: usize) -> Option<Scene>;
 }
 
 /// An error of environments.
