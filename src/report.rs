@@ -144,7 +144,7 @@ fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> Test
         success: summary.success,
         interval: (summary.interval.low, summary.interval.high),
         success_joint: summary.success_joint,
-        collision_rate: summary.collision_rate,
+        collision_rate: Some(summary.collision_rate),
         contacts: ContactMetrics::of(summary),
     }
 }

@@ -322,7 +322,7 @@ fn collision_rate(run: &Run) -> Option<f64> {
     if !run.reports_contacts() {
         return None;
     }
-    let test = run.test.as_ref().map(|test| test.collision_rate);
+    let test = run.test.as_ref().and_then(|test| test.collision_rate);
     test.or_else(|| run.last().map(|row| row.collision_rate))
 }
 
@@ -339,7 +339,7 @@ fn baseline_row(Baseline { label, test }: &Baseline, reports_contacts: bool) -> 
         none(),
         none(),
         three_digits(test.success_joint),
-        if reports_contacts { three_digits(test.collision_rate) } else { none() },
+        test.collision_rate.filter(|_| reports_contacts).map_or_else(none, three_digits),
     ]
 }
 
@@ -400,7 +400,7 @@ mod tests {
             success: 0.958,
             interval: (0.925, 0.977),
             success_joint: 0.908,
-            collision_rate: 0.175,
+            collision_rate: Some(0.175),
             contacts: ContactMetrics::default(),
         };
         Baseline { label: label.to_owned(), test }

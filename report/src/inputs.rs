@@ -83,6 +83,7 @@ impl ReportInputs {
                 Ok(run) => self.runs.push(run),
                 Err(error) => {
                     self.warnings.push(format!("{} is ignored: {error}", dir.display()));
+                    first_error.get_or_insert(error);
                 }
             }
         }
@@ -218,6 +219,18 @@ mod tests {
         let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
         assert_eq!(names, ["runs", "b", "a", "deeper"]);
         assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn a_directory_whose_only_run_cannot_be_read_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        std::fs::write(dir.path().join("a/run.toml"), b"name = \"\xff\"").unwrap();
+        let error = ReportInputs::load(&[dir.path().to_owned()]).unwrap_err();
+        assert!(error.to_string().contains("run.toml"), "{error}");
+        write(&dir.path().join("b/metrics.jsonl"), &line(1));
+        let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+        assert_eq!((inputs.runs.len(), inputs.warnings.len()), (1, 1));
     }
 
     #[test]

@@ -348,7 +348,7 @@ mod tests {
             success: 0.95,
             interval: (0.94, 0.96),
             success_joint: 0.9,
-            collision_rate: 0.2,
+            collision_rate: Some(0.2),
             contacts: ContactMetrics::default(),
         };
         let baseline = Baseline { label: "composed teachers".to_owned(), test };

@@ -38,15 +38,17 @@ impl Run {
     pub fn load(dir: &Path, warnings: &mut Vec<String>) -> Result<Self, Error> {
         let rows = read_metrics(&dir.join("metrics.jsonl"), warnings)?;
         let configuration = read_if_present(&dir.join("run.toml"))?;
+        let teacher = teacher_of(dir);
+        let mut run =
+            Self { name: directory_name(dir), rows, configuration, teacher, ..Self::default() };
         let summary = dir.join("summary.json");
-        let test = match summary.exists() {
-            true => TestEvaluation::load_summary(&summary)
-                .map_err(|error| warnings.push(error.to_string()))
-                .ok()
-                .flatten(),
-            false => None,
-        };
-        Ok(Self { name: directory_name(dir), rows, configuration, test, teacher: teacher_of(dir) })
+        if summary.exists() {
+            match TestEvaluation::load_summary(&summary, run.max_env_steps()) {
+                Ok(test) => run.test = test,
+                Err(error) => warnings.push(error.to_string()),
+            }
+        }
+        Ok(run)
     }
 
     /// Returns whether the run has taken advice.
@@ -91,6 +93,13 @@ impl Run {
             settings.insert("teacher".to_owned(), Value::String(teacher.clone()));
         }
         settings
+    }
+
+    /// Returns the number of environment steps after which the run ends, from the configuration; 0 for a run that ends
+    /// otherwise.
+    fn max_env_steps(&self) -> Option<u64> {
+        let max_env_steps = self.settings().get("stop")?.get("max_env_steps")?.as_integer()?;
+        u64::try_from(max_env_steps).ok()
     }
 
     /// Returns the name of the task, from the configuration or, for a built-in task, else from the run's name.

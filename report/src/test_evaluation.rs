@@ -23,8 +23,9 @@ pub struct TestEvaluation {
     pub interval: (f64, f64),
     /// Share of episodes with the joint norm within the tolerance, in [0, 1].
     pub success_joint: f64,
-    /// Share of episodes with at least one contact between the arms, or between an arm and the table.
-    pub collision_rate: f64,
+    /// Share of episodes with at least one contact between the arms, or between an arm and the table. `None` for a task
+    /// that reports no contacts.
+    pub collision_rate: Option<f64>,
     /// Measures that tell contacts apart, as far as they are known.
     pub contacts: ContactMetrics,
 }
@@ -40,16 +41,21 @@ impl TestEvaluation {
             .map_err(|problem| Error::InvalidEvaluation { path: path.to_owned(), problem })
     }
 
-    /// Reads the summary of a run. Returns `None` for a run without test goals, whose summary has no success.
+    /// Reads the summary of a run that ends after `max_env_steps` environment steps, if this is known.
+    ///
+    /// Returns `None` for a run without test goals, whose summary has no success, and for the summary of a shorter run,
+    /// which remains when a learner without `tandem train` extends the run.
     ///
     /// # Errors
     /// If the file cannot be read, or its last line is not a summary.
-    pub fn load_summary(path: &Path) -> Result<Option<Self>, Error> {
+    pub fn load_summary(path: &Path, max_env_steps: Option<u64>) -> Result<Option<Self>, Error> {
         let text = read_text(path).map_err(read_error(path))?;
         let problem = |problem| Error::InvalidEvaluation { path: path.to_owned(), problem };
         let object = last_object(&text).map_err(problem)?;
         let is_summary = object.get("digest").is_some();
-        if is_summary && object.get("success").is_none() {
+        let length = object.get("max_env_steps").and_then(Value::as_u64);
+        let is_of_shorter = length.zip(max_env_steps).is_some_and(|(of, now)| of != now);
+        if is_summary && (is_of_shorter || object.get("success").is_none()) {
             return Ok(None);
         }
         Self::of(&object).map(Some).map_err(problem)
@@ -77,8 +83,8 @@ impl TestEvaluation {
             success_joint: number("success_joint")?,
             collision_rate: match object.get("collision_rate") {
                 // Of a task that reports no contacts.
-                Some(Value::Null) => 0.0,
-                _ => number("collision_rate")?,
+                Some(Value::Null) => None,
+                _ => Some(number("collision_rate")?),
             },
             contacts: serde_json::from_value(object.clone())
                 .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
@@ -106,7 +112,7 @@ mod tests {
             TestEvaluation::parse(&format!("chatter\n{}\n", LINE.replace('\n', ""))).unwrap();
         assert_eq!((test.task.as_str(), test.n_arms, test.n_episodes), ("push", 2, 240));
         assert_eq!((test.success, test.interval), (0.958, (0.925, 0.977)));
-        assert_eq!((test.success_joint, test.collision_rate), (0.9, 0.175));
+        assert_eq!((test.success_joint, test.collision_rate), (0.9, Some(0.175)));
         assert_eq!(test.contacts, ContactMetrics::default(), "of an earlier version");
     }
 
@@ -140,7 +146,7 @@ mod tests {
         let path = dir.path().join("summary.json");
         let load = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            TestEvaluation::load_summary(&path)
+            TestEvaluation::load_summary(&path, None)
         };
         let served = r#"{"task":"lab/reach","arms":2,"env_steps":2400,"digest":"5f3a"}"#;
         assert_eq!(load(served).unwrap(), None);
@@ -148,6 +154,19 @@ mod tests {
         assert!(load(r#"{"task":"push","success":"high","digest":"5f3a"}"#).is_err());
         let tested = load(&LINE.replace('\n', "")).unwrap();
         assert_eq!(tested.map(|test| test.task), Some("push".to_owned()));
+    }
+
+    #[test]
+    fn the_summary_of_a_shorter_run_has_no_evaluation_of_the_extended_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("summary.json");
+        let of_2400 = r#""digest":"5f3a","max_env_steps":2400,"collision_rate""#;
+        std::fs::write(&path, LINE.replace('\n', "").replace(r#""collision_rate""#, of_2400))
+            .unwrap();
+        let has_test =
+            |max_env_steps| TestEvaluation::load_summary(&path, max_env_steps).unwrap().is_some();
+        assert!(has_test(Some(2400)) && has_test(None));
+        assert!(!has_test(Some(4800)));
     }
 
     #[test]

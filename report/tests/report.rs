@@ -283,7 +283,7 @@ action = [2, 3]
 fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     let dir = tempfile::tempdir().unwrap();
     seed_of(dir.path(), "ea", 1, &[row(0, 0), row(5, 120)]);
-    let described = dir.path().join("reach-2-ea-seed1");
+    let described = dir.path().join("lab-reach-2-ea-seed1");
     std::fs::create_dir(&described).unwrap();
     std::fs::write(described.join("run.toml"), DESCRIBED).unwrap();
     let mut log = MetricsLog::open(&described.join("metrics.jsonl")).unwrap();
@@ -300,7 +300,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
             success: 0.75,
             interval: (0.69, 0.8),
             success_joint: 0.7,
-            collision_rate: 0.0,
+            collision_rate: None,
             contacts: ContactMetrics::default(),
         },
     };
@@ -332,7 +332,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
         assert_eq!(text.contains("Figure"), name.starts_with("push") && name.contains("epochs"));
     }
     let csv = tandem_report::export::csv(&comparison);
-    assert!(csv.lines().any(|line| line.starts_with("lab/reach,2,ea,ea,reach-2-ea-seed1,1,")));
+    assert!(csv.lines().any(|line| line.starts_with("lab/reach,2,ea,ea,lab-reach-2-ea-seed1,1,")));
 
     check_pages_of_runs(&described, &dir.path().join("push-ea-seed1"));
 }

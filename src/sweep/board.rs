@@ -95,7 +95,8 @@ impl Board {
 fn run_view(status: &RunStatus) -> SweepRunView {
     let (name, config) = (&status.run.name, &status.run.config);
     let group = name.strip_suffix(&format!("-seed{}", config.seed)).unwrap_or(name);
-    let group = group.strip_prefix(&format!("{}-", config.task)).unwrap_or(group);
+    let task = config.task.replace('/', "-");
+    let group = group.strip_prefix(&format!("{task}-")).unwrap_or(group);
     let evaluations = rows(&status.dir);
     let mut view = SweepRunView {
         name: name.clone(),
