@@ -128,17 +128,44 @@ pub(crate) fn of_actions<'a>(
     number: u64,
 ) -> Result<FilmEpisode, SimError> {
     let task = TaskSpec::from(world.layout());
-    let mut steps = vec![moment(&world, &task)];
+    let mut n_succeeding = vec![0; task.n_arms()];
+    let mut steps = vec![moment(&world, &task, &mut n_succeeding)];
     for action in actions {
         world.step(action)?;
-        steps.push(moment(&world, &task));
+        steps.push(moment(&world, &task, &mut n_succeeding));
     }
     Ok(FilmEpisode { title: format!("{}, episode {number}", task.name()), steps })
 }
 
-fn moment(world: &Env, task: &TaskSpec) -> FilmStep {
+/// Returns a moment, and counts in `n_succeeding` the consecutive moments in which each arm succeeds. A goal is achieved
+/// once its arm has succeeded in as many as the task demands.
+fn moment(world: &Env, task: &TaskSpec, n_succeeding: &mut [usize]) -> FilmStep {
     let mut observation = vec![0.0; task.n_observation()];
     world.observe(&mut observation);
-    let achieved = task.arms().map(|arm| task.arm_succeeds(arm, &observation, world.goal()));
-    FilmStep { achieved: achieved.collect(), scene: world.scene() }
+    let mut achieved = Vec::with_capacity(n_succeeding.len());
+    for (arm, n_succeeding) in task.arms().zip(n_succeeding) {
+        let succeeds = task.arm_succeeds(arm, &observation, world.goal());
+        achieved.push(has_held(n_succeeding, succeeds, task.success_steps()));
+    }
+    FilmStep { achieved, scene: world.scene() }
+}
+
+/// Counts a moment in which an arm succeeds or not, and returns whether it has succeeded in the latest `n_required`.
+const fn has_held(n_succeeding: &mut usize, succeeds: bool, n_required: usize) -> bool {
+    *n_succeeding = if succeeds { *n_succeeding + 1 } else { 0 };
+    *n_succeeding >= n_required
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_goal_is_achieved_once_it_has_held_for_the_steps_that_count() {
+        let mut n_succeeding = 0;
+        let steps = [true, true, false, true, true, true, true, false];
+        let held = steps.map(|succeeds| has_held(&mut n_succeeding, succeeds, 3));
+        assert_eq!(held, [false, false, false, false, false, true, true, false]);
+        assert!(has_held(&mut 0, true, 1));
+    }
 }
