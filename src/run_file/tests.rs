@@ -57,6 +57,19 @@ fn a_described_task_has_its_own_defaults_and_survives_the_file() {
 }
 
 #[test]
+fn an_interval_that_follows_from_a_described_tasks_length_is_the_default() {
+    let resolved = |more: &str| from_text(&format!("{more}{}", described())).expect("valid");
+    for recipe in ["paper", "tandem"] {
+        let recipe = format!("recipe = \"{recipe}\"\n");
+        assert!(has_default_interval(&resolved(&recipe)), "{recipe}");
+        let longer = resolved(&format!("{recipe}stop.max_env_steps = 100_000_000\n"));
+        assert!(has_default_interval(&longer), "{recipe}");
+        let other = resolved(&format!("{recipe}evaluation.every_env_steps = 777\n"));
+        assert!(!has_default_interval(&other), "{recipe}");
+    }
+}
+
+#[test]
 fn an_invalid_description_is_refused_by_field() {
     let check = |from: &str, to: &str, words: &str| {
         let changed = described().replacen(from, to, 1);

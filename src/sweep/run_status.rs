@@ -1,5 +1,6 @@
 //! The status of a run of the sweep, as found in its directory.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow};
@@ -134,19 +135,22 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
 fn differences(existing: &RunConfig, planned: &RunConfig) -> anyhow::Result<Vec<(String, String)>> {
     let has_default_interval = run_file::has_default_interval(planned);
     let [existing, planned] = [existing, planned].map(Table::try_from);
-    let (existing, planned) = (flattened(&existing?), flattened(&planned?));
+    let by_key = |table: Table| flattened(&table).into_iter().collect::<BTreeMap<_, _>>();
+    let (existing, planned) = (by_key(existing?), by_key(planned?));
     // A run of an earlier version has no early evaluations, and an extended run keeps the interval that followed from its
     // first length. Evaluations affect nothing that a run learns.
     let is_ignored = |key: &str| {
         let is_interval = key == "evaluation.every_env_steps" && has_default_interval;
         is_interval || key == "evaluation.early_points"
     };
-    let differing = existing
-        .iter()
-        .zip(&planned)
-        .filter(|(existing, planned)| existing != planned && !is_ignored(&existing.0));
-    let texts = differing.map(|((key, existing), (_, planned))| {
-        let text = format!("{key} is {} there, {} now", shortest(existing), shortest(planned));
+    let keys: BTreeSet<&String> = existing.keys().chain(planned.keys()).collect();
+    let differing = keys
+        .into_iter()
+        .map(|key| (key, existing.get(key), planned.get(key)))
+        .filter(|(key, existing, planned)| existing != planned && !is_ignored(key));
+    let shown = |value: Option<&Value>| value.map_or_else(|| "absent".to_owned(), shortest);
+    let texts = differing.map(|(key, existing, planned)| {
+        let text = format!("{key} is {} there, {} now", shown(existing), shown(planned));
         (key.clone(), text)
     });
     Ok(texts.collect())
@@ -203,7 +207,8 @@ fn summary(dir: &Path) -> anyhow::Result<Option<Json>> {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
-    use tandem_core::Task;
+    use tandem_core::task::Reflection;
+    use tandem_core::{Layout, Task, TaskDescription, TaskSpec};
     use tandem_rl::config::Recipe;
 
     use super::*;
@@ -267,6 +272,31 @@ mod tests {
             assert!(message.contains(word), "{message:?} lacks {word:?}");
         }
         assert_eq!(status(out.path(), 0.9).expect("fits").state, State::Started);
+    }
+
+    #[test]
+    fn a_setting_that_one_of_two_runs_lacks_is_the_only_difference() {
+        let described = |name: &str, reflection: Reflection| {
+            let layout = Layout::new(Task::SharedPush, 2).description();
+            let task = TaskDescription { name: name.to_owned(), reflection, ..layout };
+            let mut config = RunConfig::defaults_of(
+                Recipe::Tandem,
+                &TaskSpec::new(task.clone()).expect("valid"),
+            );
+            config.description = Some(task);
+            config
+        };
+        let reflection = Layout::new(Task::SharedPush, 2).description().reflection;
+        let (with, without) =
+            (described("lab/push", reflection), described("lab/push", Reflection::default()));
+        let mut same_otherwise = with.clone();
+        same_otherwise.replay.reflection_prob = without.replay.reflection_prob;
+        let found = differences(&without, &same_otherwise).expect("tables");
+        assert!(!found.is_empty());
+        for (key, text) in found {
+            assert!(key.starts_with("description.reflection."), "{text}");
+            assert!(text.contains("is absent there"), "{text}");
+        }
     }
 
     #[test]

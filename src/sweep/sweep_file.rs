@@ -316,6 +316,8 @@ fn axes(file: &SweepFile) -> anyhow::Result<Vec<Choice>> {
             bail!("[[axis]] holds {held}: expected one setting with a list of values");
         };
         ensure!(!values.is_empty(), "the list of axis {key} is empty");
+        let n_runs = combinations.len() * values.len();
+        ensure!(n_runs <= MAX_RUNS, "lists {n_runs} runs and more: expected at most {MAX_RUNS}");
         let short = key.rsplit('.').next().unwrap_or(key);
         let with = |(before, value): (&Choice, &Value)| Choice {
             name: format!("{}-{short}-{}", before.name, sanitized(&unquoted(value))),

@@ -102,6 +102,10 @@ fn errors_fit_on_one_line() {
     check("seeds = [18446744073709551615]", &["seed"]);
     check("[[axis]]\n\"ddpg.polyak_keep\" = 0.9", &["axis", "list"]);
     check("[[axis]]\n\"ddpg.polyak\" = [0.9]", &["ddpg.polyak"]);
+    let axes: String = ["ddpg.polyak_keep", "ddpg.discount", "ddpg.bc_weight"]
+        .map(|key| format!("[[axis]]\n\"{key}\" = {:?}\n", [0.5; 1000]))
+        .concat();
+    check(&axes, &["lists 1000000 runs", "10000"]);
     check("[[axis]]\nseed = []", &["seed", "empty"]);
     for key in ["tasks", "strategies", "seeds", "axis", "variant"] {
         check(&format!("{key} = []"), &[key, "is an empty list"]);
