@@ -46,7 +46,7 @@ pub(super) fn export(args: &ExportArgs) -> Result<(), Failed> {
     for (role, path, encode) in networks {
         let Some(path) = path else { continue };
         let file = encode(&policy).or_exit(Exit::Data, String::new)?;
-        atomic_file::replace(path, &file)
+        atomic_file::replace_target(path, &file)
             .or_cannot_write(|| format!("cannot write {}", path.display()))?;
         written.push((role, path, digest(&file)));
     }
@@ -90,7 +90,9 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
             ),
         ));
     }
-    policy.save(&args.out).or_cannot_write(String::new)?;
+    let file = policy.to_bytes().or_exit(Exit::Data, String::new)?;
+    atomic_file::replace_target(&args.out, &file)
+        .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
     if args.json {
         return output::print(json!({
             "file": args.out.to_string_lossy(), "task": layout.name(), "arms": layout.n_arms(), "digest": policy.digest(),

@@ -1,9 +1,10 @@
 //! `tandem policy symmetrize`.
 
 use serde_json::json;
+use tandem_system::atomic_file;
 
 use crate::cli::SymmetrizeArgs;
-use crate::exit::{Failed, OrExit as _};
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::output::check_distinct;
 use crate::{output, policy_file};
 
@@ -27,7 +28,9 @@ pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     policy
         .metadata
         .retain(|key, _| !key.starts_with("evaluation_success") && key != "evaluation_episodes");
-    policy.save(&args.out).or_cannot_write(String::new)?;
+    let bytes = policy.to_bytes().or_exit(Exit::Data, String::new)?;
+    atomic_file::replace_target(&args.out, &bytes)
+        .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
     let (n_layers, n_hidden) = (policy.n_hidden_layers, policy.n_hidden);
     if args.json {
         return output::print(json!({
