@@ -201,9 +201,9 @@ impl Sampler {
         }
         let are_independent = || match self.sample.steps[..] {
             [_] => true,
+            _ if self.layout.has_reflected_scene() => true,
             [first, second] => {
-                self.layout.has_reflected_scene()
-                    || (self.layout.has_recombinable_arms() && is_apart(buffer, [first, second]))
+                self.layout.has_recombinable_arms() && is_apart(buffer, [first, second])
             }
             _ => false,
         };

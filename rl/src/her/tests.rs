@@ -1,6 +1,7 @@
 use tandem_core::layout::{EPISODE_STEPS, Layout};
 use tandem_core::reward::sparse_reward;
 use tandem_core::rng::{Stream, episode_rng};
+use tandem_core::task::ArmDescription;
 use tandem_core::{Contacts, Episode, Task};
 
 use super::*;
@@ -229,6 +230,31 @@ fn arms_that_are_near_each_other_are_reflected_with_the_whole_scene_only() {
     assert!(none(reflected_rows_of(&of_arms, 1.0, in_front)));
     assert!(reflected_rows(2, 1.0, in_front).iter().all(|(reflected, _)| *reflected));
     assert!(none(reflected_rows(1, 0.0, |_| ())));
+}
+
+#[test]
+fn three_arms_are_reflected_with_the_whole_scene() {
+    let mut three = TaskSpec::built_in(Task::SharedPickAndPlace, 1).description().clone();
+    "three-arms".clone_into(&mut three.name);
+    three.reflection.whole_scene = true;
+    let (n_observation, n_goal, n_action) = (three.n_observation, three.n_goal, three.n_action);
+    (three.n_observation, three.n_goal, three.n_action) =
+        (3 * n_observation, 3 * n_goal, 3 * n_action);
+    three.observation_bound = three.observation_bound.repeat(3);
+    three.goal_bound = three.goal_bound.repeat(3);
+    let (first, achieved) = (three.arms.remove(0), std::mem::take(&mut three.achieved_goal));
+    let after = |indices: &[usize], n: usize| indices.iter().map(|idx| idx + n).collect::<Vec<_>>();
+    for arm in 0..3 {
+        three.achieved_goal.extend(after(&achieved, arm * n_observation));
+        three.arms.push(ArmDescription {
+            observation: after(&first.observation, arm * n_observation),
+            goal: after(&first.goal, arm * n_goal),
+            action: after(&first.action, arm * n_action),
+            ..ArmDescription::default()
+        });
+    }
+    let three = TaskSpec::new(three).unwrap();
+    assert!(reflected_rows_of(&three, 1.0, |_| ()).iter().all(|(reflected, _)| *reflected));
 }
 
 /// A batch of 256 rows from `buffer`, its numbers as they are.
