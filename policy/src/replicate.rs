@@ -25,7 +25,9 @@ impl Policy {
             (1, 1),
             "only a one-arm policy can be copied"
         );
-        assert!(layout.single_arm().as_ref() == Some(&self.layout), "arms of another task");
+        let of_one_arm = layout.single_arm();
+        let is_same = of_one_arm.is_some_and(|one| one.difference(&self.layout).is_none());
+        assert!(is_same, "arms of another task");
         let n_arms = layout.n_arms();
         let (n_hidden, n_heads) = (self.n_hidden * n_arms, n_arms);
         let actor_shape = MlpShape::actor(layout, n_hidden, self.n_hidden_layers);

@@ -69,7 +69,7 @@ impl Advisor {
     /// Creates an advisor with the accounts of `ledger`.
     ///
     /// # Errors
-    /// When the policy is not for one arm.
+    /// When the policy is not for one arm, or its task has numbers that belong to no arm.
     pub fn new(policy: impl Into<AnyPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
         let policy = policy.into();
         let layout = policy.layout();
@@ -77,6 +77,7 @@ impl Advisor {
             let (policy, n_arms) = ("this one".to_owned(), layout.n_arms());
             return Err(Error::NotOneArm { policy, n_arms });
         }
+        layout.concatenated(1).map_err(Error::NotAnArm)?;
         let info = TeacherInfo {
             digest: policy.digest().to_owned(),
             has_values: policy.has_values(),

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use tandem_core::task::InvalidTask;
 use tandem_proto::DecodeError;
 
 use crate::ledger::{LedgerError, OpenError};
@@ -23,6 +24,9 @@ pub enum Error {
         /// The number of arms of the policy.
         n_arms: usize,
     },
+    /// The task of the policy has numbers that belong to no arm.
+    #[error("a teacher needs a policy of a task in which every number belongs to the arm")]
+    NotAnArm(#[source] InvalidTask),
     /// The policy's critic has several values.
     #[error("a teacher needs a critic that returns 1 value, that of {policy} returns {n_values}")]
     NotOneValue {

@@ -183,9 +183,13 @@ async fn open_account(
     let name = decode_account_name("name", request.name)?;
     let terms = AccountTerms { budget: request.budget, strategy: request.strategy.parse()? };
     let account = name.clone();
-    let balance = advisor.run(move |advisor| advisor.open_account(&account, terms)).await?;
+    let open = move |advisor: &mut Advisor| {
+        let balance = advisor.open_account(&account, terms)?;
+        Ok((balance, advisor.warning().unwrap_or_default().to_owned()))
+    };
+    let (balance, warning) = advisor.run(open).await?;
     tracing::info!(account = name, budget = terms.budget, strategy = %terms.strategy, "account opened");
-    Ok(encode_balance(name, &balance))
+    Ok(pb::Account { warning, ..encode_balance(name, &balance) })
 }
 
 async fn get_account(
@@ -262,6 +266,7 @@ fn status(error: &Error) -> Status {
         | Error::SurplusCritic
         | Error::OpenLedger(_)
         | Error::NotOneArm { .. }
+        | Error::NotAnArm(_)
         | Error::NotOneValue { .. }
         | Error::NotACritic { .. }
         | Error::NotFinite { .. }

@@ -8,10 +8,11 @@ use crate::layout::{ArmIndex, Layout};
 impl TaskSpec {
     /// Returns the one-arm task of which each arm's part is an instance: the task of a teacher.
     ///
-    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation.
+    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation. A task of
+    /// one arm is its own one-arm task if its vectors have the order of the arm's parts.
     #[must_use]
     pub fn single_arm(&self) -> Option<Self> {
-        if self.n_arms() == 1 {
+        if self.n_arms() == 1 && self.is_in_arm_order() {
             return Some(self.clone());
         }
         if let Some(layout) = self.as_built_in() {
@@ -62,6 +63,17 @@ impl TaskSpec {
         .ok()
     }
 
+    /// Returns true if every number belongs to an arm, and the arms' parts follow each other in the vectors.
+    fn is_in_arm_order(&self) -> bool {
+        let task = self.description();
+        let ascends = |indices: fn(&ArmDescription) -> &Vec<usize>, n: usize| {
+            task.arms.iter().flat_map(indices).copied().eq(0..n)
+        };
+        ascends(|arm| &arm.observation, task.n_observation)
+            && ascends(|arm| &arm.goal, task.n_goal)
+            && ascends(|arm| &arm.action, task.n_action)
+    }
+
     /// Returns the task of `n_arms` arms whose vectors are the concatenated vectors of this task's arms: the form in
     /// which a student of any layout asks a teacher for one arm.
     ///
@@ -102,6 +114,7 @@ impl TaskSpec {
             n_action: n_arms * one.n_action,
             arms: arms.collect(),
             achieved_goal: achieved_goal.collect(),
+            contact_distances: Vec::new(),
             observation_bound: one.observation_bound.repeat(n_arms),
             goal_bound: one.goal_bound.repeat(n_arms),
             manipulation: Manipulation {

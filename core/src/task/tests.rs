@@ -244,6 +244,32 @@ fn a_common_goal_counts_for_every_arm_and_has_no_one_arm_task() {
     assert!(!task.has_recombinable_arms());
 }
 
+/// The task of one arm whose vectors are `interleaved` with nothing.
+fn of_one_arm() -> TaskDescription {
+    TaskSpec::new(interleaved()).unwrap().single_arm().unwrap().description().clone()
+}
+
+#[test]
+fn a_task_of_one_arm_is_its_own_only_in_the_order_of_the_arm_and_without_common_numbers() {
+    let mut common = of_one_arm();
+    (common.n_observation, common.observation_bound) = (3, vec![2.0; 3]);
+    assert_eq!(TaskSpec::new(common).unwrap().single_arm(), None);
+    let mut reversed = of_one_arm();
+    (reversed.arms[0].observation, reversed.achieved_goal) = (vec![1, 0], vec![1]);
+    let single = TaskSpec::new(reversed.clone()).unwrap().single_arm().unwrap();
+    assert_eq!(*single.description(), of_one_arm(), "not the order in which its policies learned");
+    assert!(single.difference(&TaskSpec::new(reversed).unwrap()).is_some());
+}
+
+#[test]
+fn arms_with_hands_and_distances_of_contacts_can_be_concatenated() {
+    let mut one = of_one_arm();
+    one.arms[0].hand = vec![0, 1, 0];
+    one.contact_distances = vec![0.1; 3];
+    let two = TaskSpec::new(one).unwrap().concatenated(2).unwrap();
+    assert_eq!((two.n_arms(), two.describes_contacts()), (2, false));
+}
+
 #[test]
 fn distances_of_contacts_need_hands() {
     let with = |hand: bool, distances: &[f32]| {
