@@ -10,6 +10,7 @@ use tandem_proto::environment::{
 };
 use tandem_proto::pb;
 use tandem_proto::pb::environment_server::{Environment, EnvironmentServer};
+use tandem_sim::SimError;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -206,9 +207,13 @@ impl PlayStream {
 fn status(error: &SessionError) -> Status {
     match error {
         SessionError::Reset(_) => Status::invalid_argument(error.to_string()),
-        SessionError::Step { .. } => {
+        SessionError::Step { source, .. } => {
             tracing::error!(%error, "step failed");
-            Status::internal(error.to_string())
+            match source {
+                // The same episode would fail again.
+                SimError::StateNotFinite { .. } => Status::data_loss(error.to_string()),
+                _ => Status::internal(error.to_string()),
+            }
         }
     }
 }
