@@ -18,6 +18,8 @@ from tandem._task import Arm, Manipulation, Norm, Reflection, Task, distance
 
 DEFAULT_BOUND = 1000.0
 """The bound of numbers for which the environment's space has none."""
+TOLERANCE_ERROR = 1e-3
+"""The largest relative error of a measured tolerance, which has four significant digits."""
 _KEYS = ("observation", "achieved_goal", "desired_goal")
 _PROBE_EPISODES = 8
 _PROBE_STEPS = 10
@@ -354,7 +356,7 @@ def _disagreement(
     for achieved, desired, reward in rewards:
         apart = distance(norm, achieved, desired)
         expected = 0.0 if apart <= tolerance else -1.0
-        if reward != expected and abs(apart - tolerance) > 1e-3 * tolerance:
+        if reward != expected and abs(apart - tolerance) > TOLERANCE_ERROR * tolerance:
             said, is_at = ("achieved", "beyond") if reward == 0.0 else ("not achieved", "within")
             return (
                 f"by compute_reward a goal at {norm} distance {apart:.4g} is {said}, {is_at} the tolerance "

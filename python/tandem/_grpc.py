@@ -38,6 +38,9 @@ _CHANNEL_OPTIONS = [
 ]
 _SERVER_OPTIONS = [
     *_OPTIONS,
+    # The streams of a client that is gone end after twenty seconds.
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
     # Ports are not shared: a second server on the same port fails.
     ("grpc.so_reuseport", 0),
     # All clients of Tandem probe idle connections; without these the server would close them as too busy.

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from tandem._describe import TOLERANCE_ERROR
 from tandem._failures import is_in_own_code
 from tandem._grpc import ServiceError
 from tandem._task import Floats, Task, distance
@@ -136,7 +137,8 @@ class GymEnvironment:
     def _check_termination(self, observation: dict[str, Any]) -> None:
         """Accepts an end because the goal is achieved, after which the environment is stepped on."""
         task = self._task
-        if distance(task.norm, observation["achieved_goal"], observation["desired_goal"]) > task.tolerance:
+        apart = distance(task.norm, observation["achieved_goal"], observation["desired_goal"])
+        if apart > task.tolerance * (1 + TOLERANCE_ERROR):
             raise InvalidEpisode(
                 f"the environment terminated at step {self._n_steps} without its goal: "
                 f"an episode always has {task.episode_steps} steps"

@@ -216,7 +216,8 @@ class PolicyServer(Server):
             if policy.n_arms != 1:
                 raise ServiceError(f"a teacher's policy drives 1 arm, this one drives {policy.n_arms}")
             task, digest, batched = task or Task.of_policy(policy), digest or policy.digest, True
-            policy, value = _functions(policy)
+            policy, own_value = _functions(policy)
+            value = value or own_value
         if task is None:
             raise ServiceError("give the task of the policy: the name of a built-in one, such as shared-push, or a Task")
         self.task = Task.built_in(task) if isinstance(task, str) else task

@@ -93,6 +93,21 @@ def test_answers_are_those_of_the_functions():
         assert answer.proposed_values == closeness(observations, goals, proposed).astype("<f4").tobytes()
 
 
+def test_a_value_function_takes_the_place_of_a_policy_files_critic():
+    policy = tandem.load_policy(TEACHER)
+    with tandem.PolicyServer(policy, value=closeness) as server:
+        observations, goals = (RNG.normal(size=(5, n)).astype(np.float32) for n in (28, 3))
+        proposed = RNG.uniform(-1, 1, (5, 3)).astype(np.float32)
+        answer = evaluate(
+            server,
+            observations=observations.astype("<f4").tobytes(),
+            goals=goals.tobytes(),
+            actions=proposed.tobytes(),
+            digest=server.digest,
+        )
+        assert answer.proposed_values == closeness(observations, goals, proposed).astype("<f4").tobytes()
+
+
 def test_a_state_is_evaluated_alone_unless_the_policy_is_batched():
     sizes = []
 

@@ -110,6 +110,17 @@ def test_an_achieved_goal_does_not_end_an_episode() -> None:
     assert ends == [(False, False)] * (STEPS - 1) + [(False, True)]
 
 
+def test_an_end_within_the_error_of_a_measured_tolerance_is_at_the_goal() -> None:
+    env = served()
+    env.reset(seed=1)
+    observation = env.step(np.zeros(2))[0]
+    apart = float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))
+    own = gymnasium.make(ID, threshold=apart * 1.0001, terminates_at=1)
+    env = tandem.ServedEnv(own, tolerance=apart * 0.9995)
+    env.reset(seed=1)
+    assert env.step(np.zeros(2))[2:4] == (False, False)
+
+
 def test_actions_outside_their_range_are_refused_and_move_nothing() -> None:
     env = served()
     with pytest.raises(gymnasium.error.ResetNeeded):
