@@ -330,11 +330,8 @@ impl Spread {
 /// heading.
 fn label(stem: &str, setup: &TaskSetup, strategy: Option<&str>) -> String {
     let task = setup.task.as_deref().unwrap_or_default();
-    // A directory has dashes in place of the `/` of its task's name, or only the last part of the name.
-    let rest = match without_prefix(stem, &task.replace('/', "-")) {
-        rest if rest == stem => without_prefix(stem, task.rsplit('/').next().unwrap_or(task)),
-        rest => rest,
-    };
+    // Directories have dashes in place of the `/` of a task's name.
+    let rest = without_prefix(stem, &task.replace('/', "-"));
     let n_arms = setup.n_arms.map(|n| n.to_string()).unwrap_or_default();
     let shortest = without_prefix(rest, &n_arms);
     match strategy {
