@@ -71,6 +71,7 @@ mod merge;
 mod node;
 mod preparation;
 mod protocol;
+mod stopping;
 mod websocket;
 
 /// Time from one exchange to the next, seconds. The arms take velocities at this rate only.
@@ -268,6 +269,7 @@ impl KinovaRosDriver {
             for arm in 0..n_stopped {
                 self.stop_arm(arm).ok();
             }
+            self.await_stops();
             self.socket.close();
             self.failure = Some(failure.clone());
         })

@@ -2,6 +2,7 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpListener;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
@@ -54,6 +55,28 @@ fn a_malformed_state_ends_the_connection_and_stops_the_arms() {
     ends(Fault::Stranger, "another node publishes /left/m1n4s200_driver/in/joint_velocity");
     ends(Fault::Logs, "/right/m1n4s200_driver logs an error: Could not get the angles");
     ends(Fault::Close, "not connected");
+}
+
+/// Rosbridge discards what it has not processed when a connection closes.
+#[test]
+fn a_connection_closes_after_the_nodes_have_answered_the_stop() {
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    let mut driver = connected(&side);
+    side.begin(Fault::Complains);
+    let is_over = AtomicBool::new(false);
+    let stopped = thread::scope(|scope| {
+        scope.spawn(|| {
+            while !is_over.load(Ordering::SeqCst) {
+                thread::sleep(Duration::from_millis(5));
+                side.pass();
+            }
+        });
+        eventually("the driver fails", || driver.listen(Duration::from_millis(20)).is_err());
+        let stopped = side.ros().nodes.each_ref().map(|node| node.stopped);
+        is_over.store(true, Ordering::SeqCst);
+        stopped
+    });
+    assert_eq!(stopped, [true; 2]);
 }
 
 #[test]
