@@ -216,15 +216,23 @@ fn way(
     Err(refused.map_or(ToStartError::Start(StartError::NoState), ToStartError::NoWay))
 }
 
-/// Returns the angles of the same posture as `goal` that are nearest to `at` within the joints' ranges.
+/// Room that a joint should have at the start on both sides, radians, so that motions can begin there.
+const ROOM_RAD: f64 = std::f64::consts::FRAC_PI_2;
+
+/// Returns the angles of the same posture as `goal` within the joints' ranges: those with room on both sides if there
+/// are any, and of these the nearest to `at`.
 fn nearest_turn(cell: &WorkCell, arm: usize, at: &Joints, goal: &Joints) -> Joints {
     let joints = cell.arms[arm].model.joints;
     Joints::from_fn(goal.len(), |joint| {
         let [low, high] = joints[joint].range_rad;
         let turns = [-2.0, -1.0, 0.0, 1.0, 2.0].map(|n| goal[joint] + n * std::f64::consts::TAU);
         let within = turns.into_iter().filter(|angle| (low..=high).contains(angle));
-        let nearest = within.min_by(|a, b| (a - at[joint]).abs().total_cmp(&(b - at[joint]).abs()));
-        nearest.unwrap_or(goal[joint])
+        let lacks_room = |angle: f64| (angle - low).min(high - angle) < ROOM_RAD;
+        let best = within.min_by(|a, b| {
+            let by_distance = (a - at[joint]).abs().total_cmp(&(b - at[joint]).abs());
+            lacks_room(*a).cmp(&lacks_room(*b)).then(by_distance)
+        });
+        best.unwrap_or(goal[joint])
     })
 }
 
@@ -254,6 +262,9 @@ fn motion(
             }
         }
         let n = n_intervals(cell, &at, &next);
+        if n == 0 {
+            continue;
+        }
         for step in 1..=n {
             for (arm, samples) in arms.iter_mut().enumerate() {
                 let [share, rate] = smooth(step as f64 / n as f64);
@@ -303,4 +314,40 @@ fn n_intervals(cell: &WorkCell, from: &[Joints], to: &[Joints]) -> usize {
 /// ends.
 fn smooth(t: f64) -> [f64; 2] {
     [t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - 2.0 * t + t * t)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::work_cell::mico_cell;
+
+    fn degrees(joints: [f64; 4]) -> Joints {
+        Joints::new(&joints.map(f64::to_radians))
+    }
+
+    #[test]
+    fn a_joint_keeps_room_at_the_start_even_if_it_turns_farther() {
+        let cell = mico_cell();
+        let goal = degrees([-1.5, 180.0, 250.0, 180.0]);
+        let from = degrees([275.0, 180.0, 250.0, 180.0]);
+        let to = nearest_turn(&cell, 0, &from, &goal);
+        assert!((to[0] - goal[0]).abs() < 1e-9, "{to:?}");
+        let near = degrees([-100.0, 180.0, 250.0, 180.0]);
+        assert!((nearest_turn(&cell, 0, &near, &goal)[0] - goal[0]).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_turn_that_is_left_out_moves_no_joint_at_once() {
+        let cell = mico_cell();
+        let from = vec![degrees([0.0, 180.0, 250.0, 180.0]); 2];
+        let to = vec![degrees([10.0, 180.0, 250.0, 180.04]); 2];
+        let motion = motion(&cell, [&from, &to], &[0.5; 2], &[&[0, 1]], &[&[3], &[1, 2], &[0]]);
+        let largest = motion.arms[0]
+            .windows(2)
+            .map(|pair| pair[0].angles.largest_difference(&pair[1].angles))
+            .fold(0.0, f64::max);
+        assert!(largest < SPEED_RADPS * PERIOD_S, "{largest}");
+        let turned = motion.arms[0][motion.arms[0].len() - 1].angles[0];
+        assert!((turned - 10_f64.to_radians()).abs() < 1e-9);
+    }
 }
