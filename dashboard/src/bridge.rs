@@ -23,6 +23,8 @@ pub struct BridgeTerms {
     pub driver: String,
     /// Version of the program.
     pub version: String,
+    /// Height of the table in the world frame, metres.
+    pub table_z_m: f64,
     /// Largest share of a motion's own speed, in (0, 1].
     pub speed: f64,
     /// Gap to the table below which the arms are stopped, metres.

@@ -15,7 +15,7 @@ use tandem_core::text::error_chain;
 use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
 use tandem_kinematics::WorkCell;
 use tandem_net::{ServerConfig, Token};
-use tandem_system::DirectoryLock;
+use tandem_system::{DirectoryLock, atomic_file};
 use tandem_telemetry::live::LiveArms;
 use tandem_telemetry::{ArmsView, MotionJournal};
 use tokio::net::TcpListener;
@@ -78,10 +78,12 @@ impl Plan {
     ) -> Result<Self, Failed> {
         let access = page_access(args, server_config.token())?;
         let journal = args.record.as_ref().map(|directory| {
+            atomic_file::create_directory(directory)
+                .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
+            // The logs of two bridges could have the same names, and each deletes old ones.
+            let lock = run_directory::lock_for("--record", directory)?;
             let journal = MotionJournal::create(directory, args.log_budget.0, metadata(args, cell));
-            let journal = journal.map_err(Failed::of_write)?;
-            // The logs of two bridges could have the same names.
-            Ok((journal, run_directory::lock_for("--record", directory)?))
+            Ok((journal.map_err(Failed::of_write)?, lock))
         });
         let journal = journal.transpose()?;
         let page = match access {
@@ -215,6 +217,7 @@ impl Page {
         let terms = BridgeTerms {
             driver: arms::name(args.arms.driver).to_owned(),
             version: VERSION.to_owned(),
+            table_z_m: operator.cell().table_z_m,
             speed: args.speed,
             table_gap_m: settings.table_gap_m,
             arms_gap_m: settings.arms_gap_m,

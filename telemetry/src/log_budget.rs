@@ -56,6 +56,15 @@ impl LogBudget {
         self.enforce_except(None)
     }
 
+    /// As [`enforce`](Self::enforce), but keeps the newest log, even if it alone exceeds the limit.
+    ///
+    /// # Errors
+    /// As [`enforce`](Self::enforce).
+    pub fn enforce_but_newest(&mut self) -> Result<usize, Error> {
+        let newest = read_logs(&self.directory)?.into_iter().max();
+        self.enforce_except(newest.as_ref().map(|log| &*log.path))
+    }
+
     fn enforce_except(&mut self, newest: Option<&Path>) -> Result<usize, Error> {
         let mut logs = read_logs(&self.directory)?;
         logs.sort_unstable();
@@ -151,6 +160,17 @@ mod tests {
             entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
         names.sort();
         names
+    }
+
+    #[test]
+    fn the_newest_log_remains_even_if_it_exceeds_the_limit() {
+        let directory = tempfile::tempdir().unwrap();
+        for name in ["motion-20260101-000001.mcap", "motion-20260101-000002.mcap"] {
+            fs::write(directory.path().join(name), [0; 100]).unwrap();
+        }
+        let mut budget = LogBudget::new(directory.path().to_owned(), 50);
+        assert_eq!(budget.enforce_but_newest().unwrap(), 1);
+        assert_eq!(names(directory.path()), ["motion-20260101-000002.mcap"]);
     }
 
     #[test]

@@ -68,7 +68,7 @@ impl MotionJournal {
         let written = std::fs::File::create(&probe).and_then(|_| std::fs::remove_file(&probe));
         written.map_err(Error::io("write to", directory))?;
         let mut budget = LogBudget::new(directory.to_owned(), budget_bytes);
-        budget.enforce()?;
+        budget.enforce_but_newest()?;
         Ok(Self {
             directory: directory.to_owned(),
             budget,

@@ -70,9 +70,12 @@ fn nanoseconds(seconds: f64) -> u64 {
 fn a_stopped_motion_leaves_a_log_with_the_reported_angles_and_the_cause() {
     let directory = tempfile::tempdir().expect("a directory");
     let bridge = Bridge::serve(&["--record", &directory.path().to_string_lossy()]);
+    let finished = ["motion-1-1.mcap", "motion-1-2.mcap"].map(|name| directory.path().join(name));
+    finished.iter().for_each(|log| std::fs::write(log, vec![0; 700_000]).expect("writes"));
     let mut second = tandem(&SERVE);
-    let second = second.arg("--record").arg(directory.path()).output().expect("runs");
-    fails_with(75, &second, "choose another --record");
+    second.args(["--log-budget", "1MB", "--record"]).arg(directory.path());
+    fails_with(75, &second.output().expect("runs"), "choose another --record");
+    finished.iter().for_each(|log| std::fs::remove_file(log).expect("the log is still there"));
     let (reported, stopped) = bridge.with_arms(|| {
         let mover = bridge.moving()?;
         let reported: Vec<Value> = (0..3).map(|_| bridge.status()).collect();
