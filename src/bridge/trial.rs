@@ -71,7 +71,7 @@ pub(crate) fn trial(args: &TrialArgs) -> Result<(), Failed> {
                 layout: Layout::new(task, 2),
                 mode: mode_of(*mode),
                 block,
-                trained_half_m: trained_half_m(policy, &block),
+                trained_half_m: trained_half_m(policy, task, &block),
                 n_rehearsals: args.rehearsals,
                 seed: args.seed,
                 speed: args.speed,
@@ -116,9 +116,10 @@ fn locked_directory(out: Option<&Path>, task: Task) -> Result<(PathBuf, Director
     unreachable!("a number is free")
 }
 
-/// Returns half the edge of the blocks that `policy` was trained with, metres. Where sizes varied it knows those of `block`.
-fn trained_half_m(policy: &NamedPolicy, block: &Block) -> f64 {
-    let is_varied = policy.policy.metadata.contains_key(RANDOMIZATION_KEY);
+/// Returns half the edge of the blocks that `policy` was trained with, metres. Where sizes varied it knows those of `block`;
+/// an object that the arms share keeps its size.
+fn trained_half_m(policy: &NamedPolicy, task: Task, block: &Block) -> f64 {
+    let is_varied = !task.shares_object() && policy.policy.metadata.contains_key(RANDOMIZATION_KEY);
     if is_varied { f64::from(block.half_m) } else { TRAINED_HALF_M }
 }
 
