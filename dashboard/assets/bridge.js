@@ -5,10 +5,12 @@ import { byId, clock, el, fetchJson, follow, isNumber, percent, setText, showTab
 const STALE_MS = 1500;
 /** Time within which the bridge has to confirm a stop. */
 const STOP_TIMEOUT_MS = 4000;
-/** Extent of the views: x, y and z, metres. */
+/** Least extent of the views: x and y, and z above the table, metres. */
 const X = [-0.55, 0.55];
 const Y = [-0.3, 0.3];
 const Z = [-0.07, 0.62];
+/** Least distance from the bases to the edges of the views, along x and y, metres. */
+const MARGINS = [0.16, 0.3];
 
 let state = null;
 let logVersion = null;
@@ -137,17 +139,27 @@ function showStop(s) {
   setText(byId("last-stop-time"), last ? `${time(last.at_unix_ms)}${s.stop ? "; the arms are stopped" : "; reset since"}` : "");
 }
 
+/** Returns the extent of the views along an axis, which contains the bases of the arms. */
+function extent(axis, s) {
+  if (axis === 2) return Z.map((z) => z + s.terms.table_z_m);
+  const bases = s.shapes.map((arm) => arm.base[axis]);
+  const [low, high] = [X, Y][axis];
+  const margin = MARGINS[axis];
+  return [Math.min(low, ...bases.map((base) => base - margin)), Math.max(high, ...bases.map((base) => base + margin))];
+}
+
 /** Draws the arms from above (`axis` 1: y) or from the side (2: z). */
 function drawView(id, axis, s) {
-  const range = axis === 1 ? Y : Z;
-  const scale = 640 / (X[1] - X[0]);
-  const height = (range[1] - range[0]) * scale;
-  const at = (point) => [(point[0] - X[0]) * scale, height - (point[axis] - range[0]) * scale];
+  const [left, right] = extent(0, s);
+  const [bottom, top] = extent(axis, s);
+  const scale = 640 / (right - left);
+  const height = (top - bottom) * scale;
+  const at = (point) => [(point[0] - left) * scale, height - (point[axis] - bottom) * scale];
   const root = byId(id);
   root.setAttribute("viewBox", `0 0 640 ${height.toFixed(0)}`);
   const parts = [];
   if (axis === 2) {
-    const y = at([0, 0, 0])[1];
+    const y = at([0, 0, s.terms.table_z_m])[1];
     parts.push(svg("line", { x1: 0, x2: 640, y1: y, y2: y, class: "table" }));
   }
   s.shapes.forEach((arm, idx) => parts.push(drawArm(arm, s.arms[idx], idx, at, scale)));

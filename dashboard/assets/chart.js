@@ -101,6 +101,9 @@ export class Chart {
     this.svg.replaceChildren();
     this.scale(all, width);
     if (!all.some(({ points }) => points.length)) {
+      this.overlay = null;
+      this.readout.textContent = "";
+      this.svg.setAttribute("aria-label", this.options.label);
       this.svg.append(svg("text", { x: width / 2, y: height / 2 - 8, "text-anchor": "middle", class: "empty" },
         "waiting for the first evaluation"));
       this.svg.append(svg("line", { x1: this.box.left, x2: this.box.right, y1: this.box.bottom, y2: this.box.bottom, class: "axis" }));

@@ -112,6 +112,8 @@ export function follow(onState, onLink, timeOf = null) {
     source = new EventSource("/events");
     source.onopen = () => {
       wait(null);
+      // The browser has connected again by itself.
+      leastOffset = Infinity;
       stateAt = aliveAt = performance.now();
       onLink("live");
     };
