@@ -138,7 +138,7 @@ pub(crate) fn of_actions<'a>(
 }
 
 /// Returns a moment, and counts in `n_succeeding` the consecutive moments in which each arm succeeds. A goal is achieved
-/// once its arm has succeeded in as many as the task demands.
+/// once its arm has succeeded in as many moments as the task requires.
 fn moment(world: &Env, task: &TaskSpec, n_succeeding: &mut [usize]) -> FilmStep {
     let mut observation = vec![0.0; task.n_observation()];
     world.observe(&mut observation);
@@ -150,7 +150,7 @@ fn moment(world: &Env, task: &TaskSpec, n_succeeding: &mut [usize]) -> FilmStep 
     FilmStep { achieved, scene: world.scene() }
 }
 
-/// Counts a moment in which an arm succeeds or not, and returns whether it has succeeded in the latest `n_required`.
+/// Counts a moment in which an arm succeeds or not. Returns whether it has succeeded in the latest `n_required` ones.
 const fn has_held(n_succeeding: &mut usize, succeeds: bool, n_required: usize) -> bool {
     *n_succeeding = if succeeds { *n_succeeding + 1 } else { 0 };
     *n_succeeding >= n_required

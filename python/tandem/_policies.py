@@ -217,7 +217,7 @@ class PolicyServer(Server):
                 raise ServiceError(f"a teacher's policy drives 1 arm, this one drives {policy.n_arms}")
             task, digest, batched = task or Task.of_policy(policy), digest or policy.digest, True
             policy, own_value = _functions(policy)
-            value = value or own_value
+            value = own_value if value is None else value
         if task is None:
             raise ServiceError("give the task of the policy: the name of a built-in one, such as shared-push, or a Task")
         self.task = Task.built_in(task) if isinstance(task, str) else task
@@ -256,7 +256,7 @@ def serve_policy(
         `[m, n_action]`; all float32.
       task: the name of a built-in task, such as `shared-push`, or a `tandem.Task` of one arm.
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
-        without it, strategies that compare values are not available.
+        without it and without the critic of a policy file, strategies that compare values are not available.
       name: the name of the policy in logs.
       digest: identifies the policy, 1 to 128 letters, digits, `-`, `_`, `.` and `:`; by default a hash of its answers in 64 fixed states.
       batched: whether to evaluate all states of a request at once. By default m is 1, so an answer does not depend on

@@ -76,17 +76,23 @@ def bits(advice):
     ]
 
 
+def five_states(server):
+    """Returns random observations, goals and actions, each of five rows, and the server's answer to them."""
+    observations, goals = (RNG.normal(size=(5, n)).astype(np.float32) for n in (28, 3))
+    proposed = RNG.uniform(-1, 1, (5, 3)).astype(np.float32)
+    answer = evaluate(
+        server,
+        observations=observations.astype("<f4").tobytes(),
+        goals=goals.tobytes(),
+        actions=proposed.tobytes(),
+        digest=server.digest,
+    )
+    return observations, goals, proposed, answer
+
+
 def test_answers_are_those_of_the_functions():
     with tandem.PolicyServer(follow, task="push", value=closeness) as server:
-        observations, goals = (RNG.normal(size=(5, n)).astype(np.float32) for n in (28, 3))
-        proposed = RNG.uniform(-1, 1, (5, 3)).astype(np.float32)
-        answer = evaluate(
-            server,
-            observations=observations.astype("<f4").tobytes(),
-            goals=goals.tobytes(),
-            actions=proposed.tobytes(),
-            digest=server.digest,
-        )
+        observations, goals, proposed, answer = five_states(server)
         actions = follow(observations, goals)
         assert answer.actions == actions.astype("<f4").tobytes()
         assert answer.values == closeness(observations, goals, actions).astype("<f4").tobytes()
@@ -96,15 +102,7 @@ def test_answers_are_those_of_the_functions():
 def test_a_value_function_takes_the_place_of_a_policy_files_critic():
     policy = tandem.load_policy(TEACHER)
     with tandem.PolicyServer(policy, value=closeness) as server:
-        observations, goals = (RNG.normal(size=(5, n)).astype(np.float32) for n in (28, 3))
-        proposed = RNG.uniform(-1, 1, (5, 3)).astype(np.float32)
-        answer = evaluate(
-            server,
-            observations=observations.astype("<f4").tobytes(),
-            goals=goals.tobytes(),
-            actions=proposed.tobytes(),
-            digest=server.digest,
-        )
+        observations, goals, proposed, answer = five_states(server)
         assert answer.proposed_values == closeness(observations, goals, proposed).astype("<f4").tobytes()
 
 
