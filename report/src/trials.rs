@@ -17,7 +17,7 @@ pub(crate) use plot::millimetres;
 pub use plot::trial_svg;
 
 /// Causes of failure, in the order of the tables.
-pub const CAUSES: [&str; 8] = [
+pub const CAUSES: [&str; 9] = [
     "not-reached",
     "condition-unmet",
     "object-lost",
@@ -25,6 +25,7 @@ pub const CAUSES: [&str; 8] = [
     "arms-touched",
     "table-touched",
     "refused",
+    "not-rehearsed",
     "stopped",
 ];
 /// Column of all other causes, and of failures without a cause.

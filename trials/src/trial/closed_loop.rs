@@ -233,7 +233,8 @@ impl TrialRunner {
             let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
             let check = if makes_room { &self.check } else { &self.step_check };
             if self.attempt(rig, state, wanted, &to, check)? {
-                return Ok(attempt == 0 && !state.progress.is_held_up());
+                let is_whole = attempt == 0 && state.withdraw.is_none();
+                return Ok(is_whole && !state.progress.is_held_up());
             }
         }
         if !state.carries {

@@ -8,7 +8,7 @@ use tandem_kinematics::Joints;
 
 use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig, SimulatedPair};
 use crate::trial::open_loop::PlannedMotion;
-use crate::trial::outcome::ObjectResult;
+use crate::trial::outcome::{FailureCause, ObjectResult};
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{Goals, TrialRig};
 use crate::trial::robustness::USED_TOLERANCE;
@@ -77,7 +77,7 @@ impl TrialRunner {
         })?;
         let (waypoints, motion) = match execution.ended {
             Ok(()) => self.blind_motion(execution.waypoints, at),
-            Err(cause) => (Vec::new(), Err(cause)),
+            Err(cause) => (Vec::new(), Err(FailureCause::NotRehearsed(Box::new(cause)))),
         };
         Ok(PlannedMotion {
             waypoints,
@@ -150,5 +150,20 @@ mod tests {
         assert_eq!(n_failed(&start, 1), None);
         let solved = TrialStart { goals: start.objects.clone(), ..start.clone() };
         assert_eq!(n_failed(&solved, 0), Some(0));
+    }
+
+    #[test]
+    fn a_stop_on_the_copy_is_not_one_of_the_pair() {
+        let mut config = test_config(Task::SharedPush, TrialMode::Twin, 1);
+        // Joints that hardly follow their commands.
+        config.simulated.lag_s = 100.0;
+        let mut runner = TrialRunner::new(config).unwrap();
+        let mut policy = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.5);
+        let report = runner.run(0, &mut policy, &mut NoObserver).unwrap();
+        let Some(FailureCause::NotRehearsed(cause)) = report.cause else {
+            panic!("{:?}", report.cause)
+        };
+        assert_eq!(cause.name(), "stopped");
+        assert!(report.objects.iter().all(|object| object.start.distance(object.end) < 1e-3));
     }
 }

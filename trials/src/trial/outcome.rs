@@ -18,6 +18,8 @@ const REACH_M: f64 = 0.27;
 pub enum FailureCause {
     /// The motion could not be planned, or the check refused it. Nothing moved.
     Refused(MotionRefusal),
+    /// The rehearsal on a copy of the pair ended with this cause, so the pair has no motion. Nothing moved.
+    NotRehearsed(Box<Self>),
     /// The envelope stopped the arms.
     Stopped(Stop),
     /// Parts of both arms touched.
@@ -64,6 +66,7 @@ impl FailureCause {
     pub const fn name(&self) -> &'static str {
         match self {
             Self::Refused(_) => "refused",
+            Self::NotRehearsed(_) => "not-rehearsed",
             Self::Stopped(_) => "stopped",
             Self::ArmsTouched => "arms-touched",
             Self::TableTouched => "table-touched",
@@ -75,7 +78,7 @@ impl FailureCause {
     }
 
     /// All names, in the order of the table.
-    pub const NAMES: [&'static str; 8] = [
+    pub const NAMES: [&'static str; 9] = [
         "not-reached",
         "condition-unmet",
         "object-lost",
@@ -83,6 +86,7 @@ impl FailureCause {
         "arms-touched",
         "table-touched",
         "refused",
+        "not-rehearsed",
         "stopped",
     ];
 
@@ -91,6 +95,10 @@ impl FailureCause {
     pub fn detail(&self) -> Option<String> {
         match self {
             Self::Refused(by) => Some(by.to_string()),
+            Self::NotRehearsed(cause) => Some(cause.detail().map_or_else(
+                || cause.name().to_owned(),
+                |detail| format!("{} in the rehearsal: {detail}", cause.name()),
+            )),
             Self::Stopped(stop) => Some(stop.to_string()),
             _ => None,
         }

@@ -103,23 +103,28 @@ impl Variants {
             && contacts == Contacts::NONE)
     }
 
-    /// Executes the actions with displaced hands.
+    /// Displaces the hands, in a step of its own, and then executes the actions. The first action has no room for the
+    /// displacement where it moves a hand as far as possible.
     fn executed(&self, variant: &Variant, rollout: &Rollout) -> Result<(Env, Contacts), SimError> {
         let mut env = variant.env.clone();
-        let mut contacts = Contacts::NONE;
-        for (idx, step) in rollout.steps.iter().enumerate() {
-            let mut action = step.action.clone();
-            if idx == 0 {
-                for arm in self.layout.arms() {
-                    let first = self.layout.action_of(arm).start;
-                    let sign = if arm == ArmIndex(0) { 1.0 } else { -1.0 };
-                    action[first] += sign * variant.offset[0];
-                    action[first + 1] += sign * variant.offset[1];
-                }
-            }
-            contacts = contacts | env.step(&action)?;
+        let mut contacts = env.step(&self.displacement(variant))?;
+        for step in &rollout.steps {
+            contacts = contacts | env.step(&step.action)?;
         }
         Ok((env, contacts))
+    }
+
+    /// Returns the action that displaces the hands of `variant`, shape `[n_action]`.
+    fn displacement(&self, variant: &Variant) -> Vec<f32> {
+        let mut action = vec![0.0; self.layout.n_action()];
+        for arm in self.layout.arms() {
+            let first = self.layout.action_of(arm).start;
+            let sign = if arm == ArmIndex(0) { 1.0 } else { -1.0 };
+            for (axis, offset) in variant.offset.iter().enumerate() {
+                action[first + axis] = sign * offset;
+            }
+        }
+        action
     }
 }
 
@@ -178,31 +183,51 @@ mod tests {
         }
     }
 
-    #[test]
-    fn hands_are_displaced_and_idle_ones_fail_everywhere() {
-        let layout = Layout::new(Task::SharedPush, 2);
-        let (env, variants) = started(layout);
-        let idle = vec![0.0; layout.n_action()];
-        let step = RolloutStep { hands: Vec::new(), openings_m: Vec::new(), action: idle };
-        let rollout = Rollout {
-            steps: vec![step; 6],
-            goal_distances_m: vec![0.0; 2],
-            contacts: Contacts::NONE,
+    /// Returns an episode in which the hands move along x by `actions_x`, one number per step.
+    fn rollout(layout: Layout, actions_x: &[f32]) -> Rollout {
+        let step = |x: &f32| {
+            let mut action = vec![0.0; layout.n_action()];
+            for arm in layout.arms() {
+                action[layout.action_of(arm).start] = *x;
+            }
+            RolloutStep { hands: Vec::new(), openings_m: Vec::new(), action }
         };
-        for (variant, difference) in variants.worlds.iter().zip(&DIFFERENCES) {
-            let (after, _) = variants.executed(variant, &rollout).unwrap();
-            let (before, after) = (observed(&env), observed(&after));
-            let second = layout.observation_of(ArmIndex(1)).start;
-            for axis in 0..2 {
-                let offset_m = difference.offset_m[axis];
-                for (at, offset_m) in [(axis, offset_m), (second + axis, -offset_m)] {
-                    let moved_m = after[at] - before[at];
-                    assert!((moved_m - offset_m).abs() < 5e-4, "{moved_m} m");
+        Rollout {
+            steps: actions_x.iter().map(step).collect(),
+            goal_distances_m: vec![0.0; layout.n_arms],
+            contacts: Contacts::NONE,
+        }
+    }
+
+    #[test]
+    fn idle_hands_fail_everywhere() {
+        let layout = Layout::new(Task::SharedPush, 2);
+        let (_, variants) = started(layout);
+        let idle = rollout(layout, &[0.0; 6]);
+        assert_eq!(variants.n_failed(&idle, usize::MAX).unwrap(), Some(DIFFERENCES.len()));
+        assert_eq!(variants.n_failed(&idle, 3).unwrap(), None);
+    }
+
+    #[test]
+    fn hands_are_displaced_whatever_the_first_actions() {
+        let layout = Layout::new(Task::SharedPickAndPlace, 2);
+        let (_, variants) = started(layout);
+        let second = layout.observation_of(ArmIndex(1)).start;
+        for first in [0.0, 1.0, -1.0] {
+            let moves = rollout(layout, &[first, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+            let (plain, _) = variants.executed(&variants.worlds[0], &moves).unwrap();
+            let plain = observed(&plain);
+            for (variant, difference) in variants.worlds.iter().zip(&DIFFERENCES) {
+                let (displaced, _) = variants.executed(variant, &moves).unwrap();
+                let displaced = observed(&displaced);
+                for (axis, offset_m) in difference.offset_m.into_iter().enumerate() {
+                    for (at, offset_m) in [(axis, offset_m), (second + axis, -offset_m)] {
+                        let by_m = displaced[at] - plain[at];
+                        assert!((by_m - offset_m).abs() < 5e-4, "{first}: {by_m} m");
+                    }
                 }
             }
         }
-        assert_eq!(variants.n_failed(&rollout, usize::MAX).unwrap(), Some(DIFFERENCES.len()));
-        assert_eq!(variants.n_failed(&rollout, 3).unwrap(), None);
     }
 
     #[test]
