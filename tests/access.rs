@@ -172,16 +172,20 @@ async fn calls_without_the_right_token_are_rejected_without_effect() {
     let relay = ["relay", "--connect", &learner.address, "--token-file", "token"];
     let relay = workspace.serve("relay", &relay);
 
-    let (teacher_calls, learner_calls) = (methods_of("Teacher"), methods_of("Learner"));
-    assert!(
-        teacher_calls.len() >= 7 && learner_calls.len() >= 6,
-        "{teacher_calls:?} {learner_calls:?}"
-    );
+    let bridge = workspace.serve("bridge", &["bridge", "--driver", "sim", "--token-file", "token"]);
+
+    let [teacher_calls, learner_calls, bridge_calls] =
+        ["Teacher", "Learner", "Bridge"].map(methods_of);
+    assert!(teacher_calls.len() >= 7 && learner_calls.len() >= 6 && bridge_calls.len() >= 6);
+    let services = [
+        (&teacher.address, teacher_calls),
+        (&learner.address, learner_calls.clone()),
+        (&relay.address, learner_calls),
+        (&bridge.address, bridge_calls),
+    ];
     for token in [None, Some(OTHER)] {
-        for (service, calls) in
-            [(&teacher, &teacher_calls), (&learner, &learner_calls), (&relay, &learner_calls)]
-        {
-            let intruder = caller(&service.address, token);
+        for (address, calls) in &services {
+            let intruder = caller(address, token);
             for path in calls {
                 assert_eq!(code_of(&intruder, path).await, Code::Unauthenticated, "{path}");
             }

@@ -218,12 +218,15 @@ fn a_teacher_serves_and_charges_nothing_after_malformed_input() {
             let refused = client.advise(request).await.expect_err("cannot be answered");
             assert_eq!(refused.code(), code, "{refused}");
         }
-        let long = pb::OpenAccountRequest {
-            name: "long".to_owned(),
-            budget: 1,
-            strategy: "x".repeat(3 << 20),
-        };
-        assert!(client.open_account(long).await.is_err(), "no such strategy");
+        for (n_mib, code) in [(3, Code::InvalidArgument), (5, Code::OutOfRange)] {
+            let long = pb::OpenAccountRequest {
+                name: "long".to_owned(),
+                budget: 1,
+                strategy: "x".repeat(n_mib << 20),
+            };
+            let refused = client.open_account(long).await.expect_err("no such strategy");
+            assert_eq!(refused.code(), code, "{n_mib} MiB");
+        }
         let name = pb::GetAccountRequest { name: "attacked".to_owned() };
         let mut late = teacher_client(address).await;
         let untouched = late.get_account(name.clone()).await.expect("served").into_inner();
@@ -262,7 +265,7 @@ fn a_bridge_keeps_the_arms_at_rest_and_serves_after_malformed_input() {
             status = client.status(pb::BridgeStatusRequest {}).await.expect("served").into_inner();
         }
         assert_eq!(status.phase(), pb::BridgePhase::Stopped, "the arms were never reset");
-        assert!(status.at_rest, "{status:?}");
+        assert!(status.at_rest && status.arms.len() == 2, "{status:?}");
         for (arm, x_m) in status.arms.iter().zip([-0.12, 0.12]) {
             for (at_m, was_m) in arm.tool_in_world_m.iter().zip([x_m, 0.0, 0.095]) {
                 assert!((at_m - was_m).abs() < 0.001, "{arm:?}");

@@ -192,13 +192,13 @@ async fn connect(address: SocketAddr) -> Option<(Channel, tonic::client::Grpc<Ch
 fn crowd(service: &Service, behaviors: &[Behavior], check: impl Fn(&Service)) {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(1).enable_all().build().expect("a runtime");
-    let since = Instant::now();
+    let (since, idle_share) = (Instant::now(), service.cpu_share());
     for behavior in behaviors {
         let clients = behavior.crowd(&runtime, service.address);
         service.wait_until_full();
         check(service);
         let share = service.cpu_share();
-        assert!(share < 0.7, "{behavior:?}: {share:.2} cores");
+        assert!(share < idle_share + 0.5, "{behavior:?}: {share:.2} cores, idle {idle_share:.2}");
         assert!(service.n_files() < MAX_FILES, "{behavior:?}: {} files", service.n_files());
         drop(clients);
     }

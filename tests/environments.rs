@@ -100,7 +100,7 @@ fn script(directory: &TempDir, name: &str, text: &str) -> String {
 }
 
 fn eventually(condition: impl Fn() -> bool) -> bool {
-    (0..300).any(|_| {
+    (0..2400).any(|_| {
         let holds = condition();
         if !holds {
             std::thread::sleep(Duration::from_millis(50));

@@ -312,7 +312,7 @@ fn an_interrupted_run_whose_directory_was_moved_says_so() {
     let message = stderr(&ended);
     assert_eq!(ended.status.code(), Some(75), "{message}");
     let line = message.lines().last().unwrap_or_default();
-    let is_named = line.contains("was moved, removed or replaced") || line.contains("the learner");
+    let is_named = line.contains("was moved, removed or replaced");
     assert!(is_named && !message.contains("is saved"), "{message}");
 }
 

@@ -102,7 +102,7 @@ fn one_module_prints() {
     let files = dirs.flat_map(|dir| rust_files(&dir));
     for path in files.filter(|path| *path != printer && !is_test(path)) {
         let text = fs::read_to_string(&path).expect("readable");
-        let program = text.split("#[cfg(test)]").next().unwrap_or_default();
+        let program = without_tests(&text);
         for word in ["print!(", "println!(", "stdout()", "stderr().lock()"] {
             assert!(!program.contains(word), "{} must not contain `{word}`", path.display());
         }
@@ -276,7 +276,7 @@ fn module_uses(directory: &Path) -> BTreeMap<String, BTreeSet<String>> {
         for path in sources.filter(|path| !path.ends_with("tests.rs")) {
             let depth = path.strip_prefix(directory).expect("below").components().count();
             let text = fs::read_to_string(&path).expect("readable");
-            let program = text.split("#[cfg(test)]").next().unwrap_or_default();
+            let program = without_tests(&text);
             let is_code = |line: &&str| !line.trim_start().starts_with("//");
             let program = program.lines().filter(is_code).collect::<Vec<_>>().join("\n");
             let from_root = "super::".repeat(depth);
@@ -292,6 +292,12 @@ fn module_uses(directory: &Path) -> BTreeMap<String, BTreeSet<String>> {
         uses.insert(module.clone(), used);
     }
     uses
+}
+
+/// Returns what precedes the unit tests of a file. They may also be declared at its top and lie in a file of their own.
+fn without_tests(text: &str) -> String {
+    let text = text.replace("#[cfg(test)]\nmod tests;\n", "");
+    text.split("#[cfg(test)]").next().unwrap_or_default().to_owned()
 }
 
 /// The modules that the root of a crate declares, those for its unit tests left out.

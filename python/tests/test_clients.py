@@ -17,6 +17,8 @@ POLICY = str(ROOT / "policies/teacher-push-classic.safetensors")
 HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
 BUSY = {"late", "owner-silent", "state-old", "state-stale", "command-lost", "drive-fault"}
 """Reasons for which a busy machine may stop the arms."""
+N_ATTEMPTS = 20
+"""More than a busy machine needs."""
 
 
 def test_a_teacher_answers_and_its_refusals_are_errors():
@@ -85,7 +87,7 @@ def unless_busy(error):
 def test_a_motion_is_played_to_its_end():
     with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge:
         assert bridge.describe().driver == "sim"
-        for _ in range(5):
+        for _ in range(N_ATTEMPTS):
             try:
                 with bridge.lease() as lease:
                     lease.reset()
@@ -94,7 +96,7 @@ def test_a_motion_is_played_to_its_end():
             except tandem.ServiceError as error:
                 unless_busy(error)
         else:
-            pytest.skip("the machine is too busy to move arms")
+            pytest.fail("no attempt moved the arms to the end")
         assert last.played_s == pytest.approx(last.duration_s)
         for arm, way_point in zip(bridge.status().arms, HOME):
             assert np.allclose(arm.tool_in_world_m, way_point.tool_m, atol=0.01)
@@ -103,7 +105,7 @@ def test_a_motion_is_played_to_its_end():
 def test_a_motion_that_the_check_refuses_raises_an_error():
     with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge, bridge.lease() as lease:
         below_table = (tandem.WayPoint((-0.1, 0.0, -0.5)), tandem.WayPoint((0.1, 0.0, -0.5)))
-        for _ in range(5):
+        for _ in range(N_ATTEMPTS):
             with pytest.raises(tandem.ServiceError) as raised:
                 lease.reset()
                 lease.move([below_table], speed=1.0)
@@ -111,12 +113,12 @@ def test_a_motion_that_the_check_refuses_raises_an_error():
                 break
             unless_busy(raised.value)
         else:
-            pytest.skip("the machine is too busy to move arms")
+            pytest.fail("no attempt moved the arms to the end")
 
 
 def test_a_stop_ends_a_motion_with_its_reason():
     with service("bridge", "--driver", "sim") as address, tandem.Bridge(address) as bridge, bridge.lease() as lease:
-        for _ in range(5):
+        for _ in range(N_ATTEMPTS):
             # A busy machine may stop the arms before the motion starts, which is then refused.
             with pytest.raises((tandem.MotionStopped, tandem.CallError)) as raised:
                 lease.reset()
@@ -125,7 +127,7 @@ def test_a_stop_ends_a_motion_with_its_reason():
             if isinstance(raised.value, tandem.MotionStopped) and raised.value.name == "requested":
                 break
         else:
-            pytest.skip("the machine is too busy to move arms")
+            pytest.fail("no attempt moved the arms to the end")
         assert bridge.status().HasField("stopped")
 
 

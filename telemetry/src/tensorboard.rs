@@ -225,8 +225,9 @@ mod tests {
         assert_eq!(crc32c::crc32c(b"123456789"), 0xe306_9283, "the check value of CRC-32C");
         let record = encode_record(&version);
         assert_eq!(&record[..8], &15_u64.to_le_bytes());
+        assert_eq!(&record[8..12], &0x092b_536d_u32.to_le_bytes(), "of the length");
         assert_eq!(&record[12..27], b"\x1a\x0dbrain.Event:2");
-        assert_eq!(record.len(), 31);
+        assert_eq!(&record[27..], &0x2951_98fc_u32.to_le_bytes(), "of the event");
     }
 
     #[test]

@@ -267,6 +267,9 @@ fn unusable_inputs_are_reported_in_one_line() {
             .lines()
             .filter(|line| line.starts_with("tandem: ") || line.starts_with("error: "));
         assert!(lines.count() == 1 || stderr.starts_with("Trains policies"), "{line}: {stderr}");
+        if stderr.starts_with("tandem: ") {
+            assert_eq!(stderr.lines().count(), 1, "{line}: {stderr}");
+        }
         assert!(stderr.len() < 3000, "{line}: {} bytes", stderr.len());
     }
     assert!(!directory.path().join("mended").exists(), "garbage was recovered");

@@ -72,6 +72,14 @@ fn operators_describe_reset_move_and_stop() {
 fn an_impossible_motion_is_refused_and_moves_nothing() {
     let bridge = Bridge::serve(&[]);
     bridge.reset();
+    let tools_m = || -> Vec<f64> {
+        let status = bridge.status();
+        let arms = status["arms"].as_array().expect("arms");
+        let tools = arms.iter().filter_map(|arm| arm["tool_in_world_m"].as_array());
+        tools.flatten().filter_map(serde_json::Value::as_f64).collect()
+    };
+    let before_m = tools_m();
+    assert_eq!(before_m.len(), 6, "{before_m:?}");
     let file = bridge.directory.path().join("motion.json");
     let path = file.to_string_lossy();
     let try_out = |text: &str, expected: &str| {
@@ -103,6 +111,9 @@ fn an_impossible_motion_is_refused_and_moves_nothing() {
     try_out(&one_arm.to_string(), "way_points[0].arms: expected 2 arms, got 1 arms");
     let missing = Path::new("no-such-motion.json").to_string_lossy();
     fails_with(65, &bridge.run(&["move", &missing]), "cannot read \"no-such-motion.json\"");
+    let after_m = tools_m();
+    let has_moved = before_m.iter().zip(&after_m).any(|(a, b)| (a - b).abs() > 1e-3);
+    assert!(after_m.len() == 6 && !has_moved, "{before_m:?} {after_m:?}");
     let mut nowhere = tandem(&["bridge", "move", &path, "--connect", "nowhere"]);
     fails_with(64, &nowhere.output().expect("runs"), "is not an address");
 }

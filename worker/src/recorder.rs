@@ -255,6 +255,31 @@ mod tests {
     }
 
     #[test]
+    fn training_episodes_beyond_the_queue_are_left_out_and_evaluations_wait() {
+        let (queue, recordings) = sync_channel(1);
+        let left_out_logged = Arc::<AtomicBool>::default();
+        let recorder = Recorder {
+            queue,
+            episodes: RecordedEpisodes::All,
+            left_out_logged: left_out_logged.clone(),
+        };
+        let mut played = traced(&[3, 4, 5]).into_iter();
+        let mut next = || played.next().expect("three episodes");
+        recorder.try_record(next());
+        assert!(!left_out_logged.load(Ordering::Relaxed));
+        recorder.try_record(next());
+        assert!(left_out_logged.load(Ordering::Relaxed), "the second is left out");
+        let evaluation = next();
+        let waits = std::thread::spawn(move || recorder.record(evaluation));
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        assert!(!waits.is_finished(), "it waits for room");
+        let numbers: Vec<u64> =
+            recordings.iter().map(|recording| recording.episode.number).collect();
+        waits.join().expect("no panic");
+        assert_eq!(numbers, [3, 5]);
+    }
+
+    #[test]
     fn a_log_that_cannot_be_written_pauses_recording() {
         let directory = tempfile::tempdir().expect("a directory");
         let logs = directory.path().join("mcap");

@@ -212,8 +212,8 @@ fn a_missing_checkpoint_is_no_error() {
 #[test]
 fn a_writer_killed_at_any_byte_leaves_the_former_checkpoint_in_use() {
     let (directory, _) = saved(2);
-    let (whole, unfinished) =
-        (fs::read(newest(&directory)).expect("readable"), newest(&directory).with_extension("tmp"));
+    let whole = fs::read(newest(&directory)).expect("readable");
+    let unfinished = newest(&directory).with_extension("safetensors.tmp");
     fs::remove_file(newest(&directory)).expect("removes");
     let former = newest(&directory);
     for n_bytes in (0..whole.len()).step_by(1009).chain([whole.len()]) {

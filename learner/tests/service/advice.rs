@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
+use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, Task, TaskSpec};
 use tandem_learner::checkpoint;
@@ -19,6 +20,8 @@ use crate::service_tests::toy::{UNITS, claim, config};
 
 /// More than the toy spends.
 const AMPLE: u64 = 10_000;
+/// So few units that they run out on the way.
+const SCARCE: u64 = 180;
 
 pub(crate) fn advised(lag: u32, budget: u64) -> RunConfig {
     let mut config = config(lag);
@@ -74,39 +77,52 @@ async fn calm(run: RunConfig) -> (Left, FakeTeacher) {
 
 /// 9 rounds of 8 episodes, half of them advised.
 const N_ADVISED: u64 = 36;
+/// The advised episodes of a round.
+const N_OPEN: u64 = 4;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_lost_account_is_reopened_with_the_remaining_budget() {
     for lag in [0, 1] {
         for lost_after in [1, 6, 13, 30] {
-            let directory = tempfile::tempdir().expect("a directory");
-            let teacher = FakeTeacher::default();
-            let address = teacher.serve().await;
-            // So much that it runs out on the way.
-            let budget = 180;
-            let run = advised(lag, budget);
-            let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
-            let mut toy = served.join("toy").await;
-            let mut n_delivered = 0;
-            while play_one(&mut toy, &teacher).await {
-                n_delivered += 1;
-                if n_delivered == lost_after {
-                    teacher.books().accounts.clear();
-                }
-            }
-            let ended = served.end().await.expect("the run ends");
-            assert!(!ended.interrupted);
-            let books = teacher.books();
-            let [(first, _), (second, left)] = books.opened.as_slice() else {
-                panic!("{:?}", books.opened);
-            };
-            assert_eq!((first.as_str(), second.as_str()), ("toy", "toy"), "workers ask as before");
-            assert!(*left < budget && books.charged_ever <= budget, "{}", books.charged_ever);
-            let rows = Left::behind(&ended, directory.path()).rows;
-            let last = rows.last().expect("rows");
-            assert_eq!(last.advice_spent, books.charged_ever, "what was learned from");
-            assert_eq!(last.budget_left, budget - last.advice_spent);
+            check_a_lost_account(lag, lost_after, SCARCE).await;
+            check_a_lost_account(lag, lost_after, AMPLE).await;
         }
+    }
+}
+
+/// Loses the account of a run with `budget` once `lost_after` slots are delivered.
+async fn check_a_lost_account(lag: u32, lost_after: usize, budget: u64) {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    let run = advised(lag, budget);
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    let (mut n_delivered, mut charged) = (0, 0);
+    while play_one(&mut toy, &teacher).await {
+        n_delivered += 1;
+        if n_delivered == lost_after {
+            let mut books = teacher.books();
+            charged = books.charged_ever;
+            books.accounts.clear();
+        }
+    }
+    let ended = served.end().await.expect("the run ends");
+    assert!(!ended.interrupted);
+    let books = teacher.books();
+    let [(first, _), (second, left)] = books.opened.as_slice() else {
+        panic!("{:?}", books.opened);
+    };
+    assert_eq!((first.as_str(), second.as_str()), ("toy", "toy"), "workers ask as before");
+    assert!(*left < budget && books.charged_ever <= budget, "{}", books.charged_ever);
+    let written_off = N_OPEN * (1 + u64::from(lag)) * EPISODE_STEPS as u64;
+    assert!(*left + charged + written_off >= budget, "{left} of {budget} after {charged}");
+    let rows = Left::behind(&ended, directory.path()).rows;
+    let last = rows.last().expect("rows");
+    assert_eq!(last.advice_spent, books.charged_ever, "what was learned from");
+    assert_eq!(last.budget_left, budget - last.advice_spent);
+    if budget == AMPLE {
+        assert_eq!(last.advice_spent, N_ADVISED * u64::from(UNITS), "advised to the end");
     }
 }
 

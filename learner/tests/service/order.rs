@@ -1,9 +1,10 @@
-//! Neither the number of workers nor the order in which they deliver shows.
+//! Neither the number of workers, nor the order in which they deliver, nor the number of threads shows.
 
 use std::time::Duration;
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::{Stream, episode_rng, index};
+use tandem_learner::LearnerConfig;
 
 use crate::service_tests::run::{Left, Served, Toy, calm, deliver_as, learner_config};
 use crate::service_tests::toy::config;
@@ -48,5 +49,20 @@ async fn the_order_of_arrival_does_not_affect_the_run() {
             let ended = served.end().await.expect("a run");
             assert_eq!(Left::behind(&ended, directory.path()), expected, "lag {lag}, seed {seed}");
         }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_number_of_threads_does_not_affect_the_run() {
+    let mut run = config(0);
+    // Several blocks of rows, which threads share.
+    (run.ddpg.n_hidden, run.ddpg.batch_size) = (64, 300);
+    let expected = calm(run.clone()).await;
+    for n_threads in [2, 5] {
+        let directory = tempfile::tempdir().expect("a directory");
+        let config =
+            LearnerConfig { n_threads, ..learner_config(run.clone(), directory.path(), false) };
+        let ended = Served::start(config).await.finish(1).await.expect("a run");
+        assert_eq!(Left::behind(&ended, directory.path()), expected, "{n_threads} threads");
     }
 }

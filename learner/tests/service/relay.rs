@@ -212,6 +212,40 @@ async fn a_failed_fetch_is_repeated() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_oldest_of_more_than_sixteen_versions_is_dropped() {
+    let fake = Fake::default();
+    fake.n_versions.store(100, Ordering::SeqCst);
+    let (address, _relay) = relay(fake.serve().await).await;
+    let client = client(address).await;
+    let in_order = (0..17).map(|version| (version, version + 1));
+    for (version, n_fetched) in in_order.chain([(16, 17), (1, 17), (0, 18)]) {
+        parameters(&client, version).await.expect("parameters");
+        assert_eq!(fake.n_fetched(), n_fetched, "version {version}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_learner_keeps_the_last_sixteen_versions() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let mut run = config(0);
+    run.stop.max_env_steps = 20 * 400;
+    let served = Served::start(learner_config(run, directory.path(), false)).await;
+    let mut toy = served.join("toy").await;
+    let mut client = served.client().await;
+    let round = loop {
+        assert!(toy.play_one().await, "twenty rounds");
+        let progress = client.status(pb::StatusRequest {}).await.expect("answers").into_inner();
+        if progress.round > 16 {
+            break progress.round;
+        }
+    };
+    parameters(&client, round).await.expect("the newest");
+    let status = parameters(&client, 0).await.expect_err("no longer kept");
+    assert_eq!(status.code(), Code::NotFound, "{status:?}");
+    served.finish(1).await.expect("a run");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn parameters_of_a_former_learner_are_dropped() {
     let fake = Fake::default();
     fake.n_versions.store(1, Ordering::SeqCst);

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use tandem_learner::checkpoint::{self, CheckpointError};
 use tandem_learner::{Error, LearnerConfig, RunOutcome};
@@ -10,6 +11,7 @@ use tandem_telemetry::MetricsLog;
 use tempfile::TempDir;
 
 use crate::service_tests::run::{Left, Served, calm, copy_all, learner_config, real_clock};
+use crate::service_tests::silence::clock_of;
 use crate::service_tests::toy::config;
 
 async fn resume(run: RunConfig, out: &Path) -> Result<RunOutcome, Error> {
@@ -194,4 +196,30 @@ async fn a_new_run_does_not_overwrite_a_former_one_nor_join_a_running_one() {
     let refused = anew.end().await.expect_err("a run is there");
     assert!(matches!(refused, Error::Checkpoint(CheckpointError::RunExists(_))), "{refused}");
     assert_eq!(MetricsLog::read_all(&out.join("metrics.jsonl")).expect("rows"), rows);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_ends_after_its_minutes_and_a_resumed_one_has_none_left() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let seconds = Arc::new(AtomicU64::new(0));
+    let mut run = config(0);
+    (run.stop.max_env_steps, run.stop.max_minutes) = (0, 1.0);
+    let of = |resume| {
+        let clock = clock_of(&seconds);
+        LearnerConfig { clock, ..learner_config(run.clone(), directory.path(), resume) }
+    };
+    let served = Served::start(of(false)).await;
+    let mut toy = served.join("toy").await;
+    seconds.store(59, Ordering::Relaxed);
+    for _ in 0..4 {
+        assert!(toy.play_one().await, "the slots of a round");
+    }
+    assert!(toy.play_one().await, "there is time for a second round");
+    seconds.store(60, Ordering::Relaxed);
+    while toy.play_one().await {}
+    let ended = served.end().await.expect("a run");
+    let rows = Left::behind(&ended, directory.path()).rows;
+    assert_eq!((ended.interrupted, rows.last().expect("rows").round), (false, 2));
+    let resumed = Served::start(of(true)).await.end().await.expect("it is over");
+    assert_eq!(resumed.digest, ended.digest);
 }

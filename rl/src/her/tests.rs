@@ -70,6 +70,28 @@ fn a_hindsight_goal_was_achieved_later_in_the_episode() {
 }
 
 #[test]
+fn all_later_steps_are_equally_likely_hindsight_goals() {
+    // All goals of hindsight, those of the later half, of the next step and of the last one.
+    let counts = std::cell::Cell::new([0_u32; 4]);
+    sampled(RewardKind::PerArm, |sampler, _| {
+        let (x, first) = (sampler.sample.goal[0], sampler.sample.steps[0]);
+        if first.episode_idx != 0 || x >= 9.0 || first.step_idx > EPISODE_STEPS - 10 {
+            return;
+        }
+        let (step, goal) = (first.step_idx, (x / 0.01).round() as usize);
+        assert!((step + 1..=EPISODE_STEPS).contains(&goal), "{goal} after {step}");
+        let is_late = 2 * (goal - step) > EPISODE_STEPS - step + 1;
+        let is = [true, is_late, goal == step + 1, goal == EPISODE_STEPS];
+        let mut now = counts.get();
+        now.iter_mut().zip(is).for_each(|(count, is)| *count += u32::from(is));
+        counts.set(now);
+    });
+    let [all, late, next, last] = counts.get();
+    assert!((0.43..0.55).contains(&(f64::from(late) / f64::from(all))), "{late} of {all}");
+    assert!(next > 0 && last > 0 && next + last < all / 2, "{next} and {last} of {all}");
+}
+
+#[test]
 fn rewards_match_the_sampled_goal() {
     sampled(RewardKind::PerArm, |sampler, buffer| {
         for arm in LAYOUT.arms() {
