@@ -2,6 +2,7 @@
 //! the charges of the account.
 
 mod audit;
+mod error;
 mod watcher;
 
 use std::sync::Arc;
@@ -10,69 +11,28 @@ use std::time::Duration;
 
 use tandem_core::task::TaskDifference;
 use tandem_core::{Episode, TaskSpec};
-use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry};
+use tandem_net::{AuthChannel, Backoff, ClientConfig, Operation, retry};
 use tandem_proto::pb::teacher_client::TeacherClient;
-use tandem_proto::{DecodeError, decode_task, pb};
+use tandem_proto::{decode_task, pb};
 use tandem_telemetry::TeacherView;
 use tandem_telemetry::events::AdviceAccountOpened;
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
-use tonic::{Code, Status};
+use tonic::Status;
 use tracing::warn;
 
 use crate::runtime::Runtime;
 use crate::shared::Clock;
 use crate::warnings::{Source, Warnings};
 use audit::{Audit, Cost, Statement};
-use watcher::AccountWatcher;
+pub(crate) use error::TeacherError;
+use watcher::{AccountWatcher, warn_of_other_policy};
 
 /// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// Pauses before a failed call is repeated.
 const BACKOFF: Backoff =
     Backoff { first_pause: Duration::from_millis(100), max_pause: Duration::from_secs(1) };
-
-/// A failed call to the teacher.
-#[derive(Debug, thiserror::Error)]
-pub enum TeacherError {
-    /// The address is malformed.
-    #[error("the teacher cannot be called")]
-    Address(#[from] ClientConfigError),
-    /// The teacher refused; a retry would not help.
-    #[error("the teacher refuses to {what}: {reason}")]
-    Refused {
-        /// The request.
-        what: &'static str,
-        /// The reason that it gave.
-        reason: String,
-    },
-    /// The teacher's response cannot be decoded.
-    #[error("the teacher's task cannot be read")]
-    Malformed(#[from] DecodeError),
-    /// The teacher advises on another task.
-    #[error(
-        "the teacher is for another task than one arm of the run's: {} is {} in the run and {} at the teacher",
-        .0.field, .0.first, .0.second
-    )]
-    OtherTask(TaskDifference),
-    /// The teacher does not know the account.
-    #[error("the teacher does not know the account: {0}")]
-    UnknownAccount(String),
-    /// The run was stopped while the teacher was unreachable.
-    #[error("stopped while waiting for the teacher")]
-    Stopped,
-}
-
-impl TeacherError {
-    /// Returns the error for a status that a retry would not cure.
-    fn of(what: &'static str, status: &Status) -> Self {
-        let reason = status.message().to_owned();
-        match status.code() {
-            Code::NotFound => Self::UnknownAccount(reason),
-            _ => Self::Refused { what, reason },
-        }
-    }
-}
 
 /// The start of a run, for the opening of its account.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -129,6 +89,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) units_per_episode: u32,
     /// The start of the run.
     pub(crate) start: RunStart,
+    /// The digest of the teacher's policy when the run began, if it is known.
+    pub(crate) first_policy: Option<String>,
     /// Receives the state of the teacher.
     pub(crate) view: watch::Sender<TeacherView>,
     /// Measures for how long the teacher has not answered.
@@ -149,6 +111,8 @@ pub(crate) struct AdviceAccount {
     /// The budget of an account of this name that was never lost.
     full_budget: u64,
     audit: Audit,
+    /// The digest of the teacher's policy when the run began.
+    policy: String,
     /// True after the teacher reported that it does not know the account.
     lost: Arc<AtomicBool>,
     _watch: DropGuard,
@@ -166,7 +130,7 @@ impl AdviceAccount {
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let AccountOptions { client_config, address, one_arm, terms, .. } = options;
-        let AccountOptions { units_per_episode, start, view, clock, .. } = options;
+        let AccountOptions { units_per_episode, start, first_policy, view, clock, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -181,23 +145,16 @@ impl AdviceAccount {
             open_episodes: Vec::new(),
             full_budget: budget,
             audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
+            policy: String::new(),
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
         let policy = account.check_task(one_arm)?;
-        match start {
-            RunStart::New => {
-                let found = account.open_account(budget, 0)?;
-                account.warn_if_used(found, warnings);
-            }
-            // If the teacher lost the account meanwhile, it was opened again with what was left.
-            RunStart::Restarted => {
-                let found = account.balance()?.map_or(budget, |found| found.budget.min(budget));
-                account.open_account(found, 0)?;
-            }
-            RunStart::Resumed { spent } => account.resume(spent)?,
-        }
-        let watcher = AccountWatcher::new((client, policy), lost, (warnings.clone(), view), clock);
+        account.policy = first_policy.unwrap_or_else(|| policy.clone());
+        warn_of_other_policy(warnings, &policy, &account.policy);
+        account.begin(start, warnings)?;
+        let first = account.policy.clone();
+        let watcher = AccountWatcher::new((client, first), lost, (warnings.clone(), view), clock);
         let watch = watcher.watch(account.terms.name.clone());
         runtime.spawn(async move {
             tokio::select! {
@@ -206,6 +163,24 @@ impl AdviceAccount {
             }
         });
         Ok(account)
+    }
+
+    /// Opens the account, or continues with it.
+    fn begin(&mut self, start: RunStart, warnings: &Warnings) -> Result<(), TeacherError> {
+        let budget = self.terms.budget;
+        match start {
+            RunStart::New => {
+                let found = self.open_account(budget, 0)?;
+                self.warn_if_used(found, warnings);
+                Ok(())
+            }
+            // If the teacher lost the account meanwhile, it was opened again with what was left.
+            RunStart::Restarted => {
+                let found = self.balance()?.map_or(budget, |found| found.budget.min(budget));
+                self.open_account(found, 0).map(drop)
+            }
+            RunStart::Resumed { spent } => self.resume(spent),
+        }
     }
 
     /// Warns of an account that an earlier run has used: a new run gets the verdicts on the steps of the earlier one,
@@ -247,6 +222,11 @@ impl AdviceAccount {
     /// Returns the name under which workers ask for advice.
     pub(crate) fn name(&self) -> &str {
         &self.terms.name
+    }
+
+    /// Returns the digest of the teacher's policy when the run began, if it is known.
+    pub(crate) fn policy(&self) -> Option<&str> {
+        Some(self.policy.as_str()).filter(|digest| !digest.is_empty())
     }
 
     /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts

@@ -100,6 +100,8 @@ struct LearnerLoop<'a> {
     /// The parameters that play the round that is being awaited.
     acting: PublishedActor,
     account: Option<AdviceAccount>,
+    /// The digest of the teacher's policy when the run began, if it is known.
+    teacher_policy: Option<String>,
     evaluations: Evaluations<'a>,
     persistence: Persistence<'a>,
     progress: ProgressPublisher<'a>,
@@ -390,6 +392,7 @@ impl<'a> LearnerLoop<'a> {
             acting: &self.acting,
             evaluations: &mut self.evaluations,
             wall_s: self.progress.wall_s(),
+            teacher_policy: self.teacher_policy.as_deref(),
         };
         (&mut self.persistence, state)
     }

@@ -104,6 +104,7 @@ impl InitialState {
             // An episode can use one unit of advice per step.
             units_per_episode: u32::try_from(layout.episode_steps())
                 .expect("an episode has few steps"),
+            first_policy: self.resumption.teacher_policy.clone(),
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),
             start: match self.is_resumed {
@@ -152,8 +153,14 @@ fn new_run(config: &LearnerConfig) -> Result<(Trainer, Resumption), Error> {
         let teacher = config.start_from.as_ref().ok_or_else(none)?;
         trainer.start_from(teacher).map_err(Error::StartFrom)?;
     }
-    let (acting, history) = (trainer.publish(), EvaluationHistory::default());
-    Ok((trainer, Resumption { acting, history, pending: Vec::new(), wall_s: 0.0 }))
+    let resumption = Resumption {
+        acting: trainer.publish(),
+        history: EvaluationHistory::default(),
+        pending: Vec::new(),
+        wall_s: 0.0,
+        teacher_policy: None,
+    };
+    Ok((trainer, resumption))
 }
 
 impl<'a> LearnerLoop<'a> {
@@ -165,7 +172,8 @@ impl<'a> LearnerLoop<'a> {
     ) -> Self {
         let Context { config, shared, .. } = context;
         let InitialState { trainer, resumption, lock, .. } = initial;
-        let Resumption { acting, history, pending, wall_s } = resumption;
+        let Resumption { acting, history, pending, wall_s, teacher_policy } = resumption;
+        let policy = account.as_ref().and_then(AdviceAccount::policy).map(str::to_owned);
         let terms = RunTerms {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
@@ -184,6 +192,7 @@ impl<'a> LearnerLoop<'a> {
             trainer,
             acting,
             account,
+            teacher_policy: policy.or(teacher_policy),
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),

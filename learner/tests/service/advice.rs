@@ -302,6 +302,36 @@ async fn a_teacher_restarted_with_another_policy_is_warned_of() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_resumed_with_another_policy_of_its_teacher_is_warned_of() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    teacher.books().policy_digest = "5f3a".repeat(16);
+    let address = teacher.serve().await;
+    let mut run = advised(0, AMPLE);
+    run.stop.max_env_steps /= 2;
+    let served = Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    served.end().await.expect("the first half");
+    run.stop.max_env_steps *= 2;
+    let other =
+        "the teacher was restarted with another policy, 0b1c0b1c0b1c instead of 5f3a5f3a5f3a, ";
+    // However often the run is resumed, the policy counts with which it began.
+    for (policy, expected) in [("0b1c", other), ("0b1c", other), ("5f3a", "")] {
+        teacher.books().policy_digest = policy.repeat(16);
+        let config = with_teacher(run.clone(), directory.path(), true, address);
+        let served = Served::start(config).await;
+        let mut toy = served.join("toy").await;
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
+        let warning = progress.into_inner().warning;
+        assert_eq!(warning.is_empty(), expected.is_empty(), "{warning}");
+        assert!(warning.starts_with(expected), "{warning}");
+        served.shutdown.cancel();
+        served.end().await.expect("stopped");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_teacher_for_another_task_is_refused_and_the_field_named() {
     let directory = tempfile::tempdir().expect("a directory");
     let teacher = FakeTeacher::default();
