@@ -85,8 +85,6 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) one_arm: &'a TaskSpec,
     /// Name, budget and strategy, from the run file.
     pub(crate) terms: pb::OpenAccountRequest,
-    /// Units that an episode can use.
-    pub(crate) units_per_episode: u32,
     /// The start of the run.
     pub(crate) start: RunStart,
     /// The digest of the teacher's policy when the run began, if it is known.
@@ -105,9 +103,10 @@ pub(crate) struct AdviceAccount {
     shutdown: CancellationToken,
     /// Name, budget and strategy, from the run file.
     terms: pb::OpenAccountRequest,
-    units_per_episode: u32,
     /// Advised episodes whose leases are open.
     open_episodes: Vec<u64>,
+    /// The most units that each of them can use.
+    units_per_episode: u32,
     /// The budget of an account of this name that was never lost.
     full_budget: u64,
     audit: Audit,
@@ -130,7 +129,7 @@ impl AdviceAccount {
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let AccountOptions { client_config, address, one_arm, terms, .. } = options;
-        let AccountOptions { units_per_episode, start, first_policy, view, clock, .. } = options;
+        let AccountOptions { start, first_policy, view, clock, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -141,8 +140,8 @@ impl AdviceAccount {
             runtime: runtime.clone(),
             shutdown: shutdown.clone(),
             terms,
-            units_per_episode,
             open_episodes: Vec::new(),
+            units_per_episode: 0,
             full_budget: budget,
             audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
             policy: String::new(),
@@ -229,16 +228,18 @@ impl AdviceAccount {
         Some(self.policy.as_str()).filter(|digest| !digest.is_empty())
     }
 
-    /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts
-    /// the units of the episodes learned so far.
+    /// Reserves `units_per_episode` for each of a round's advised episodes, or what is left, in their order, and
+    /// returns the reserved units. `spent` counts the units of the episodes learned so far. No other lease may be open.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
+        units_per_episode: u32,
         spent: u64,
     ) -> Result<Vec<Allowance>, TeacherError> {
         if episodes.is_empty() {
             return Ok(Vec::new());
         }
+        self.units_per_episode = units_per_episode;
         let mut n_losses = 0;
         let opened = loop {
             match self.call_open_leases(&episodes) {

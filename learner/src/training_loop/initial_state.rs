@@ -101,9 +101,6 @@ impl InitialState {
                 budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
-            // An episode can use one unit of advice per step.
-            units_per_episode: u32::try_from(layout.episode_steps())
-                .expect("an episode has few steps"),
             first_policy: self.resumption.teacher_policy.clone(),
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),

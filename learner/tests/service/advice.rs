@@ -332,6 +332,24 @@ async fn a_run_resumed_with_another_policy_of_its_teacher_is_warned_of() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_short_horizon_reserves_only_the_units_of_its_steps() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    // In the last round 76 units are left for four episodes of 20 guided steps each, of which each uses 7.
+    let spent = N_ADVISED * u64::from(UNITS);
+    let mut run = advised(0, spent + 48);
+    run.advice.strategy = "jsrl:20".to_owned();
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    let ended = served.end().await.expect("a run");
+    let rows = Left::behind(&ended, directory.path()).rows;
+    let last = rows.last().expect("rows");
+    assert_eq!((last.advice_spent, last.budget_left), (spent, 48));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_teacher_for_another_task_is_refused_and_the_field_named() {
     let directory = tempfile::tempdir().expect("a directory");
     let teacher = FakeTeacher::default();
