@@ -1,6 +1,6 @@
 //! The state with which a run starts: new, or from its newest checkpoint.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
@@ -33,6 +33,8 @@ pub(super) struct InitialState {
     pub(super) trainer: Trainer,
     resumption: Resumption,
     is_resumed: bool,
+    /// Whether the run was started before.
+    was_started: bool,
     lock: RunLock,
 }
 
@@ -49,6 +51,7 @@ impl InitialState {
             None
         };
         let is_resumed = restored.is_some();
+        let was_started = config.resume && was_started(config);
         let (mut trainer, resumption) = match restored {
             Some(Restored { path, trainer, resumption }) => {
                 RunResumed { round: trainer.counters().round, path: &path }.emit();
@@ -67,7 +70,7 @@ impl InitialState {
             return Err(Error::NetworksTooLarge { n_bytes });
         }
         check_slots(&trainer)?;
-        Ok(Self { trainer, resumption, is_resumed, lock })
+        Ok(Self { trainer, resumption, is_resumed, was_started, lock })
     }
 
     /// Returns true if the run has reached one of its ends.
@@ -106,7 +109,7 @@ impl InitialState {
             clock: config.clock.clone(),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
-                false if config.resume => RunStart::Restarted,
+                false if self.was_started => RunStart::Restarted,
                 false => RunStart::New,
             },
         };
@@ -219,6 +222,12 @@ fn publish_parameters(
     context.shared.publish(&trainer.publish());
 }
 
+/// Returns true if the run was started before: a learner writes the run file once the run's account is open. One that
+/// does not write it cannot know, and is resumed by its parent process only.
+fn was_started(config: &LearnerConfig) -> bool {
+    config.run_file.is_none() || run_file_path(config).exists()
+}
+
 /// Refuses to start a new run in the directory of another, which it would overwrite.
 fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
     let has_rows = std::fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
@@ -231,7 +240,7 @@ fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
 /// Writes the settings with which the run continues.
 pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
     let Some(text) = &config.run_file else { return Ok(()) };
-    let path = config.out.join("run.toml");
+    let path = run_file_path(config);
     if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
         return Ok(());
     }
@@ -240,6 +249,10 @@ pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
         path,
         source: error.into(),
     })
+}
+
+fn run_file_path(config: &LearnerConfig) -> PathBuf {
+    config.out.join("run.toml")
 }
 
 #[cfg(test)]

@@ -251,13 +251,19 @@ async fn a_new_run_warns_of_an_account_that_a_run_of_the_same_name_has_used() {
     let (_, teacher) = calm(advised(0, AMPLE)).await;
     let address = teacher.serve().await;
     let directory = tempfile::tempdir().expect("a directory");
-    for (resume, expected) in [
-        (false, "the teacher's account \"toy\" was used before, 252 units are spent: "),
+    let used = "the teacher's account \"toy\" was used before, 252 units are spent: ";
+    for (resume, run_file, expected) in [
+        (false, None, used),
         // A run that ended before its first checkpoint has used the account itself.
-        (true, ""),
+        (true, None, ""),
+        // A supervisor's command starts a run and, the second time, continues it.
+        (true, Some("name = \"toy\""), used),
+        (true, Some("name = \"toy\""), ""),
     ] {
         let run = advised(0, AMPLE);
-        let served = Served::start(with_teacher(run, directory.path(), resume, address)).await;
+        let config = with_teacher(run, directory.path(), resume, address);
+        let run_file = run_file.map(str::to_owned);
+        let served = Served::start(LearnerConfig { run_file, ..config }).await;
         let mut toy = served.join("toy").await;
         let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
         let warning = progress.into_inner().warning;
