@@ -34,6 +34,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         history: EvaluationHistory::default(),
         pending: Vec::new(),
         wall_s: 0.0,
+        teacher_policy: None,
     };
     for _ in 0..N_TIMES {
         let start = Instant::now();

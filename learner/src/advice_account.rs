@@ -2,6 +2,7 @@
 //! the charges of the account.
 
 mod audit;
+mod error;
 mod watcher;
 
 use std::sync::Arc;
@@ -10,69 +11,28 @@ use std::time::Duration;
 
 use tandem_core::task::TaskDifference;
 use tandem_core::{Episode, TaskSpec};
-use tandem_net::{AuthChannel, Backoff, ClientConfig, ClientConfigError, Operation, retry};
+use tandem_net::{AuthChannel, Backoff, ClientConfig, Operation, retry};
 use tandem_proto::pb::teacher_client::TeacherClient;
-use tandem_proto::{DecodeError, decode_task, pb};
+use tandem_proto::{decode_task, pb};
 use tandem_telemetry::TeacherView;
 use tandem_telemetry::events::AdviceAccountOpened;
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
-use tonic::{Code, Status};
+use tonic::Status;
 use tracing::warn;
 
 use crate::runtime::Runtime;
 use crate::shared::Clock;
 use crate::warnings::{Source, Warnings};
 use audit::{Audit, Cost, Statement};
-use watcher::AccountWatcher;
+pub(crate) use error::TeacherError;
+use watcher::{AccountWatcher, warn_of_other_policy};
 
 /// Deadline of a call.
 const CALL_DEADLINE: Duration = Duration::from_secs(5);
 /// Pauses before a failed call is repeated.
 const BACKOFF: Backoff =
     Backoff { first_pause: Duration::from_millis(100), max_pause: Duration::from_secs(1) };
-
-/// A failed call to the teacher.
-#[derive(Debug, thiserror::Error)]
-pub enum TeacherError {
-    /// The address is malformed.
-    #[error("the teacher cannot be called")]
-    Address(#[from] ClientConfigError),
-    /// The teacher refused; a retry would not help.
-    #[error("the teacher refuses to {what}: {reason}")]
-    Refused {
-        /// The request.
-        what: &'static str,
-        /// The reason that it gave.
-        reason: String,
-    },
-    /// The teacher's response cannot be decoded.
-    #[error("the teacher's task cannot be read")]
-    Malformed(#[from] DecodeError),
-    /// The teacher advises on another task.
-    #[error(
-        "the teacher is for another task than one arm of the run's: {} is {} in the run and {} at the teacher",
-        .0.field, .0.first, .0.second
-    )]
-    OtherTask(TaskDifference),
-    /// The teacher does not know the account.
-    #[error("the teacher does not know the account: {0}")]
-    UnknownAccount(String),
-    /// The run was stopped while the teacher was unreachable.
-    #[error("stopped while waiting for the teacher")]
-    Stopped,
-}
-
-impl TeacherError {
-    /// Returns the error for a status that a retry would not cure.
-    fn of(what: &'static str, status: &Status) -> Self {
-        let reason = status.message().to_owned();
-        match status.code() {
-            Code::NotFound => Self::UnknownAccount(reason),
-            _ => Self::Refused { what, reason },
-        }
-    }
-}
 
 /// The start of a run, for the opening of its account.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -125,10 +85,10 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) one_arm: &'a TaskSpec,
     /// Name, budget and strategy, from the run file.
     pub(crate) terms: pb::OpenAccountRequest,
-    /// Units that an episode can use.
-    pub(crate) units_per_episode: u32,
     /// The start of the run.
     pub(crate) start: RunStart,
+    /// The digest of the teacher's policy when the run began, if it is known.
+    pub(crate) first_policy: Option<String>,
     /// Receives the state of the teacher.
     pub(crate) view: watch::Sender<TeacherView>,
     /// Measures for how long the teacher has not answered.
@@ -143,12 +103,15 @@ pub(crate) struct AdviceAccount {
     shutdown: CancellationToken,
     /// Name, budget and strategy, from the run file.
     terms: pb::OpenAccountRequest,
-    units_per_episode: u32,
     /// Advised episodes whose leases are open.
     open_episodes: Vec<u64>,
+    /// The most units that each of them can use.
+    units_per_episode: u32,
     /// The budget of an account of this name that was never lost.
     full_budget: u64,
     audit: Audit,
+    /// The digest of the teacher's policy when the run began.
+    policy: String,
     /// True after the teacher reported that it does not know the account.
     lost: Arc<AtomicBool>,
     _watch: DropGuard,
@@ -166,7 +129,7 @@ impl AdviceAccount {
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let AccountOptions { client_config, address, one_arm, terms, .. } = options;
-        let AccountOptions { units_per_episode, start, view, clock, .. } = options;
+        let AccountOptions { start, first_policy, view, clock, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -177,27 +140,20 @@ impl AdviceAccount {
             runtime: runtime.clone(),
             shutdown: shutdown.clone(),
             terms,
-            units_per_episode,
             open_episodes: Vec::new(),
+            units_per_episode: 0,
             full_budget: budget,
             audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
+            policy: String::new(),
             lost: lost.clone(),
             _watch: stop_watching.clone().drop_guard(),
         };
         let policy = account.check_task(one_arm)?;
-        match start {
-            RunStart::New => {
-                let found = account.open_account(budget, 0)?;
-                account.warn_if_used(found, warnings);
-            }
-            // If the teacher lost the account meanwhile, it was opened again with what was left.
-            RunStart::Restarted => {
-                let found = account.balance()?.map_or(budget, |found| found.budget.min(budget));
-                account.open_account(found, 0)?;
-            }
-            RunStart::Resumed { spent } => account.resume(spent)?,
-        }
-        let watcher = AccountWatcher::new((client, policy), lost, (warnings.clone(), view), clock);
+        account.policy = first_policy.unwrap_or_else(|| policy.clone());
+        warn_of_other_policy(warnings, &policy, &account.policy);
+        account.begin(start, warnings)?;
+        let first = account.policy.clone();
+        let watcher = AccountWatcher::new((client, first), lost, (warnings.clone(), view), clock);
         let watch = watcher.watch(account.terms.name.clone());
         runtime.spawn(async move {
             tokio::select! {
@@ -206,6 +162,24 @@ impl AdviceAccount {
             }
         });
         Ok(account)
+    }
+
+    /// Opens the account, or continues with it.
+    fn begin(&mut self, start: RunStart, warnings: &Warnings) -> Result<(), TeacherError> {
+        let budget = self.terms.budget;
+        match start {
+            RunStart::New => {
+                let found = self.open_account(budget, 0)?;
+                self.warn_if_used(found, warnings);
+                Ok(())
+            }
+            // If the teacher lost the account meanwhile, it was opened again with what was left.
+            RunStart::Restarted => {
+                let found = self.balance()?.map_or(budget, |found| found.budget.min(budget));
+                self.open_account(found, 0).map(drop)
+            }
+            RunStart::Resumed { spent } => self.resume(spent),
+        }
     }
 
     /// Warns of an account that an earlier run has used: a new run gets the verdicts on the steps of the earlier one,
@@ -249,16 +223,23 @@ impl AdviceAccount {
         &self.terms.name
     }
 
-    /// Reserves units for a round's advised episodes, in their order, and returns the reserved units. `spent` counts
-    /// the units of the episodes learned so far.
+    /// Returns the digest of the teacher's policy when the run began, if it is known.
+    pub(crate) fn policy(&self) -> Option<&str> {
+        Some(self.policy.as_str()).filter(|digest| !digest.is_empty())
+    }
+
+    /// Reserves `units_per_episode` for each of a round's advised episodes, or what is left, in their order, and
+    /// returns the reserved units. `spent` counts the units of the episodes learned so far. No other lease may be open.
     pub(crate) fn open_leases(
         &mut self,
         episodes: Vec<u64>,
+        units_per_episode: u32,
         spent: u64,
     ) -> Result<Vec<Allowance>, TeacherError> {
         if episodes.is_empty() {
             return Ok(Vec::new());
         }
+        self.units_per_episode = units_per_episode;
         let mut n_losses = 0;
         let opened = loop {
             match self.call_open_leases(&episodes) {

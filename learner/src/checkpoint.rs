@@ -31,6 +31,9 @@ pub struct Resumption {
     pub pending: Vec<PendingEvaluation>,
     /// Wall time of the run so far, seconds.
     pub wall_s: f64,
+    /// The digest of the teacher's policy when the run began. `None` for a run without a teacher, and for one of an
+    /// earlier version.
+    pub teacher_policy: Option<String>,
 }
 
 /// An error about a checkpoint.

@@ -12,7 +12,7 @@ mod run_lock;
 use std::time::Duration;
 
 use tandem_core::work::{PublishedActor, SlotOrder};
-use tandem_core::{AdviceUnit, Episode, EpisodeKind};
+use tandem_core::{AdviceUnit, Episode, EpisodeKind, TaskSpec};
 use tandem_rl::RunConfig;
 use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
@@ -100,6 +100,8 @@ struct LearnerLoop<'a> {
     /// The parameters that play the round that is being awaited.
     acting: PublishedActor,
     account: Option<AdviceAccount>,
+    /// The digest of the teacher's policy when the run began, if it is known.
+    teacher_policy: Option<String>,
     evaluations: Evaluations<'a>,
     persistence: Persistence<'a>,
     progress: ProgressPublisher<'a>,
@@ -223,9 +225,9 @@ impl LearnerLoop<'_> {
         let orders = self.trainer.training_orders(round, version);
         if let Some(account) = &mut self.account {
             let payers = payers(&orders, self.context.config.run.advice.unit);
-            let Some(allowances) = unless_stopped(account.open_leases(payers, spent))? else {
-                return Ok(false);
-            };
+            let units = units_per_episode(&orders, &self.trainer.layout);
+            let opened = account.open_leases(payers, units, spent);
+            let Some(allowances) = unless_stopped(opened)? else { return Ok(false) };
             let allowances = allowances.iter().map(|each| (each.episode, each.units));
             self.context.shared.lock().queue.limit_claims(allowances);
         }
@@ -390,6 +392,7 @@ impl<'a> LearnerLoop<'a> {
             acting: &self.acting,
             evaluations: &mut self.evaluations,
             wall_s: self.progress.wall_s(),
+            teacher_policy: self.teacher_policy.as_deref(),
         };
         (&mut self.persistence, state)
     }
@@ -413,6 +416,15 @@ fn payers(orders: &[SlotOrder], unit: AdviceUnit) -> Vec<u64> {
         advised.map(|order| order.number).collect::<Vec<_>>()
     };
     orders.iter().flat_map(advised).collect()
+}
+
+/// Returns the most units that an advised episode can use: one for each step on which it asks.
+fn units_per_episode(orders: &[SlotOrder], task: &TaskSpec) -> u32 {
+    let n_steps = u32::try_from(task.episode_steps()).expect("an episode has few steps");
+    let advised = orders.iter().flat_map(|slot| &slot.episodes).filter(|order| order.advised);
+    let units =
+        advised.map(|order| order.advised_steps.map_or(n_steps, |asked| asked.min(n_steps)));
+    units.max().unwrap_or(0)
 }
 
 /// Logs the workers that fell silent, the first [`MAX_SILENT_LINES`] by name: there can be thousands.

@@ -5,6 +5,7 @@
 //! twice and counts once.
 
 mod check;
+mod worker;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
@@ -14,13 +15,14 @@ use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
 pub use check::{SubmitError, check_count};
 use check::{check, check_claims};
+pub use worker::{SilentWorker, Worker};
 
 /// A worker that has not called for this time counts as dead: its slots return to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
 /// A slot that has been assigned for this time, and for twice the recent mean, is also assigned to a second worker that
 /// is idle.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
-/// A worker that has not called for this time is removed. Until then its episodes are accepted: it may have been slow
+/// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been slow
 /// and not dead.
 pub const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most workers in a run.
@@ -34,7 +36,9 @@ pub const ASK_WITHIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct WorkQueue {
     next_slot: u64,
-    next_worker: u64,
+    /// The number after which workers are numbered, and that of the latest worker.
+    first_worker: u64,
+    latest_worker: u64,
     waiting: VecDeque<SlotOrder>,
     assigned: BTreeMap<u64, Assignment>,
     /// Assigned slots by the time of their assignment: every idle worker asks for the first.
@@ -67,34 +71,6 @@ struct Connection {
     workers: BTreeSet<u64>,
     /// The number of these that have delivered no episodes.
     n_unproven: usize,
-}
-
-/// A worker that has joined the run.
-#[derive(Debug, Clone)]
-pub struct Worker {
-    /// Its label, which it chose itself.
-    pub name: String,
-    /// Time of its latest call.
-    pub last_seen: Duration,
-    /// Training and evaluation episodes that it has delivered.
-    pub n_episodes: u64,
-    /// The slot assigned to it last, until it delivers the episodes. A disconnected worker may still be playing it.
-    pub slot: Option<u64>,
-    /// True if it counts as dead.
-    pub silent: bool,
-    /// The connection over which it joined, while that is open.
-    pub connection: Option<u64>,
-}
-
-/// A worker that counts as dead.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct SilentWorker {
-    /// Its number.
-    pub worker_id: u64,
-    /// Its label.
-    pub name: String,
-    /// The number of its slots that have returned to the queue.
-    pub n_slots: usize,
 }
 
 /// A refusal of a join.
@@ -133,17 +109,17 @@ impl WorkQueue {
             let removable = self.eviction_candidate(n_unproven, now);
             self.remove_worker(removable.ok_or(JoinError::RunFull)?);
         }
-        self.next_worker += 1;
+        self.latest_worker += 1;
         let worker =
             Worker { name, last_seen: now, n_episodes: 0, slot: None, silent: false, connection };
-        self.workers.insert(self.next_worker, worker);
-        self.newcomers.insert(self.next_worker);
+        self.workers.insert(self.latest_worker, worker);
+        self.newcomers.insert(self.latest_worker);
         if let Some(connection) = connection {
             let connection = self.connections.entry(connection).or_default();
-            connection.workers.insert(self.next_worker);
+            connection.workers.insert(self.latest_worker);
             connection.n_unproven += 1;
         }
-        Ok(self.next_worker)
+        Ok(self.latest_worker)
     }
 
     /// Returns the worker that a full queue removes for a worker whose connection has `n_unproven` others that have
@@ -224,7 +200,7 @@ impl WorkQueue {
 
     /// Sets the number after which workers are numbered.
     pub const fn start_workers_at(&mut self, first: u64) {
-        self.next_worker = first;
+        (self.first_worker, self.latest_worker) = (first, first);
     }
 
     /// Adds a slot at the end of the queue and numbers it.
@@ -268,6 +244,11 @@ impl WorkQueue {
         worker.last_seen = now;
         worker.silent = false;
         Ok(worker)
+    }
+
+    /// Returns true if a worker has joined, even if it was removed since.
+    fn has_joined(&self, worker_id: u64) -> bool {
+        (self.first_worker + 1..=self.latest_worker).contains(&worker_id)
     }
 
     /// Removes the next slot from the queue. Training comes before evaluation, because the learner waits for it sooner.
@@ -322,17 +303,22 @@ impl WorkQueue {
         (2 * self.mean_duration.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER)
     }
 
-    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before.
+    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may have
+    /// been removed meanwhile.
     ///
     /// # Errors
-    /// When the worker is unknown or there never was such a slot.
+    /// When the worker has never joined or there never was such a slot.
     pub fn order_of(
         &mut self,
         worker_id: u64,
         slot: u64,
         now: Duration,
     ) -> Result<Option<&SlotOrder>, SubmitError> {
-        self.touch(worker_id, now)?;
+        if let Err(unknown) = self.touch(worker_id, now).map(drop)
+            && !self.has_joined(worker_id)
+        {
+            return Err(unknown);
+        }
         if slot >= self.next_slot {
             return Err(SubmitError::UnknownSlot { slot, n_slots: self.next_slot });
         }
@@ -343,7 +329,7 @@ impl WorkQueue {
     /// Accepts a slot's episodes and returns true if they are new; a slot that was delivered before changes nothing.
     ///
     /// # Errors
-    /// When the worker or the slot is unknown, or the episodes do not match the order.
+    /// When the worker has never joined, the slot is unknown, or the episodes do not match the order.
     pub fn submit(
         &mut self,
         worker_id: u64,

@@ -28,7 +28,7 @@ const N_DIGEST_CHARS: usize = 12;
 /// Asks for the account about once a second.
 pub(super) struct AccountWatcher {
     client: TeacherClient<AuthChannel>,
-    /// The digest of the teacher's policy when the account was opened.
+    /// The digest of the teacher's policy when the run began.
     policy: String,
     /// Set when the teacher reports that it does not know the account.
     lost: Arc<AtomicBool>,
@@ -60,24 +60,28 @@ impl AccountWatcher {
         }
     }
 
-    /// Warns if the teacher was restarted with another policy, perhaps for another task: requests for advice do not
-    /// name the policy.
     async fn check_policy(&mut self) {
         let look = self.client.describe(pb::DescribeRequest {});
         let Ok(described) = within(CALL_DEADLINE, look).await else { return };
-        let (now, first) = (described.into_inner().policy_digest, &self.policy);
-        if now == *first {
-            return;
-        }
-        let shown = |digest: &str| digest.chars().take(N_DIGEST_CHARS).collect::<String>();
-        let warning = format!(
-            "the teacher was restarted with another policy, {} instead of {}, and advises differently: restart it with \
-             the first one",
-            shown(&now),
-            shown(first)
-        );
-        self.status.warnings.set_first(Source::Policy, &warning);
+        let now = described.into_inner().policy_digest;
+        warn_of_other_policy(&self.status.warnings, &now, &self.policy);
     }
+}
+
+/// Warns if the teacher was restarted with another policy than the `first` one, perhaps for another task: requests for
+/// advice do not name the policy.
+pub(super) fn warn_of_other_policy(warnings: &Warnings, now: &str, first: &str) {
+    if now == first {
+        return;
+    }
+    let shown = |digest: &str| digest.chars().take(N_DIGEST_CHARS).collect::<String>();
+    let warning = format!(
+        "the teacher was restarted with another policy, {} instead of {}, and advises differently: restart it with the \
+         first one",
+        shown(now),
+        shown(first)
+    );
+    warnings.set_first(Source::Policy, &warning);
 }
 
 /// The state of the teacher, as displays and the progress show it.

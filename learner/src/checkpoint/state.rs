@@ -26,6 +26,8 @@ const ADVICE_QUERIES: &str = "advice_queries";
 const JUMP_START: [&str; 4] =
     ["jump_start.present", "jump_start.next", "jump_start.n_episodes", "jump_start.n_succeeded"];
 
+/// Key of the digest of the teacher's policy.
+const TEACHER_POLICY: &str = "teacher_policy";
 /// The critics of the gate of the acting parameters, with strategy `ts2c:T`.
 const ACTING_GATE: &str = "acting.gate";
 
@@ -61,6 +63,7 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
         JUMP_START.into_iter().zip(jump_start.state().map(|number| number.to_string()))
     });
     entries.extend(jump_start);
+    entries.extend(resumption.teacher_policy.iter().map(|digest| (TEACHER_POLICY, digest.clone())));
     entries
 }
 
@@ -197,6 +200,7 @@ impl Reader<'_> {
             history,
             pending: self.pending(trainer)?,
             wall_s: wall_s.filter(is_time).ok_or("its wall_s is not a time")?,
+            teacher_policy: self.contents.metadata.get(TEACHER_POLICY).cloned(),
         })
     }
 

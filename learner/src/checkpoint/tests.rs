@@ -69,6 +69,7 @@ fn resumption(trainer: &Trainer) -> Resumption {
             policy: policy("pending"),
         }],
         wall_s: 12.5,
+        teacher_policy: Some("5f3a".to_owned()),
     }
 }
 
@@ -112,6 +113,19 @@ fn a_restored_run_continues_with_the_same_bits() {
     train_round(&mut uninterrupted);
     train_round(&mut trainer);
     assert_eq!(trainer.digest(), uninterrupted.digest());
+}
+
+#[test]
+fn a_checkpoint_without_the_teachers_policy_can_be_resumed() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let mut trainer = Trainer::new(small_config()).expect("valid");
+    train_round(&mut trainer);
+    let without = Resumption { teacher_policy: None, ..resumption(&trainer) };
+    let path = save(directory.path(), &trainer, &without, 1).expect("saves").path;
+    let bytes = fs::read(path).expect("readable");
+    let key = b"teacher_policy";
+    assert!(!bytes.windows(key.len()).any(|window| window == key), "as earlier versions wrote it");
+    assert_eq!(restored(&directory).resumption.teacher_policy, None);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! The state with which a run starts: new, or from its newest checkpoint.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
@@ -33,6 +33,8 @@ pub(super) struct InitialState {
     pub(super) trainer: Trainer,
     resumption: Resumption,
     is_resumed: bool,
+    /// Whether the run was started before.
+    was_started: bool,
     lock: RunLock,
 }
 
@@ -49,6 +51,7 @@ impl InitialState {
             None
         };
         let is_resumed = restored.is_some();
+        let was_started = config.resume && was_started(config);
         let (mut trainer, resumption) = match restored {
             Some(Restored { path, trainer, resumption }) => {
                 RunResumed { round: trainer.counters().round, path: &path }.emit();
@@ -67,7 +70,7 @@ impl InitialState {
             return Err(Error::NetworksTooLarge { n_bytes });
         }
         check_slots(&trainer)?;
-        Ok(Self { trainer, resumption, is_resumed, lock })
+        Ok(Self { trainer, resumption, is_resumed, was_started, lock })
     }
 
     /// Returns true if the run has reached one of its ends.
@@ -101,14 +104,12 @@ impl InitialState {
                 budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
-            // An episode can use one unit of advice per step.
-            units_per_episode: u32::try_from(layout.episode_steps())
-                .expect("an episode has few steps"),
+            first_policy: self.resumption.teacher_policy.clone(),
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),
             start: match self.is_resumed {
                 true => RunStart::Resumed { spent: self.trainer.counters().advice_spent },
-                false if config.resume => RunStart::Restarted,
+                false if self.was_started => RunStart::Restarted,
                 false => RunStart::New,
             },
         };
@@ -152,8 +153,14 @@ fn new_run(config: &LearnerConfig) -> Result<(Trainer, Resumption), Error> {
         let teacher = config.start_from.as_ref().ok_or_else(none)?;
         trainer.start_from(teacher).map_err(Error::StartFrom)?;
     }
-    let (acting, history) = (trainer.publish(), EvaluationHistory::default());
-    Ok((trainer, Resumption { acting, history, pending: Vec::new(), wall_s: 0.0 }))
+    let resumption = Resumption {
+        acting: trainer.publish(),
+        history: EvaluationHistory::default(),
+        pending: Vec::new(),
+        wall_s: 0.0,
+        teacher_policy: None,
+    };
+    Ok((trainer, resumption))
 }
 
 impl<'a> LearnerLoop<'a> {
@@ -165,7 +172,8 @@ impl<'a> LearnerLoop<'a> {
     ) -> Self {
         let Context { config, shared, .. } = context;
         let InitialState { trainer, resumption, lock, .. } = initial;
-        let Resumption { acting, history, pending, wall_s } = resumption;
+        let Resumption { acting, history, pending, wall_s, teacher_policy } = resumption;
+        let policy = account.as_ref().and_then(AdviceAccount::policy).map(str::to_owned);
         let terms = RunTerms {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
@@ -184,6 +192,7 @@ impl<'a> LearnerLoop<'a> {
             trainer,
             acting,
             account,
+            teacher_policy: policy.or(teacher_policy),
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),
@@ -213,6 +222,12 @@ fn publish_parameters(
     context.shared.publish(&trainer.publish());
 }
 
+/// Returns true if the run was started before: a learner writes the run file once the run's account is open. One that
+/// does not write it cannot know, and is resumed by its parent process only.
+fn was_started(config: &LearnerConfig) -> bool {
+    config.run_file.is_none() || run_file_path(config).exists()
+}
+
 /// Refuses to start a new run in the directory of another, which it would overwrite.
 fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
     let has_rows = std::fs::metadata(out.join("metrics.jsonl")).is_ok_and(|file| file.len() > 0);
@@ -225,7 +240,7 @@ fn refuse_former_run(out: &Path) -> Result<(), CheckpointError> {
 /// Writes the settings with which the run continues.
 pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
     let Some(text) = &config.run_file else { return Ok(()) };
-    let path = config.out.join("run.toml");
+    let path = run_file_path(config);
     if std::fs::read(&path).is_ok_and(|there| there == text.as_bytes()) {
         return Ok(());
     }
@@ -234,6 +249,10 @@ pub(super) fn write_run_file(config: &LearnerConfig) -> Result<(), Error> {
         path,
         source: error.into(),
     })
+}
+
+fn run_file_path(config: &LearnerConfig) -> PathBuf {
+    config.out.join("run.toml")
 }
 
 #[cfg(test)]

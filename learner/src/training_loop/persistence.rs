@@ -36,6 +36,7 @@ pub(super) struct LoopState<'a, 'c> {
     pub(super) acting: &'a PublishedActor,
     pub(super) evaluations: &'a mut Evaluations<'c>,
     pub(super) wall_s: f64,
+    pub(super) teacher_policy: Option<&'a str>,
 }
 
 impl LoopState<'_, '_> {
@@ -112,6 +113,7 @@ impl<'a> Persistence<'a> {
             history: state.evaluations.history().clone(),
             pending: state.evaluations.pending().iter().cloned().collect(),
             wall_s: state.wall_s,
+            teacher_policy: state.teacher_policy.map(str::to_owned),
         };
         let directory = self.config.out.join("checkpoint");
         let keep = self.config.run.checkpoint.keep;

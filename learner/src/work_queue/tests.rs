@@ -2,6 +2,7 @@
 
 mod lock_steps;
 mod model;
+mod removed;
 
 use tandem_core::work::{EpisodeExploration, EpisodeOrder};
 use tandem_core::{Layout, Task};
@@ -352,8 +353,13 @@ fn a_worker_of_an_earlier_start_is_unknown() {
     let earlier = join(&mut WorkQueue::default(), at(0));
     let mut queue = WorkQueue::default();
     queue.start_workers_at(4096);
+    queue.push(order(0, EpisodeKind::Training));
     let later = join(&mut queue, at(0));
-    assert_eq!(queue.next(earlier, at(0)), Err(SubmitError::UnknownWorker(earlier)));
+    for stranger in [earlier, 4096, later + 1] {
+        let unknown = SubmitError::UnknownWorker(stranger);
+        assert_eq!(queue.next(stranger, at(0)), Err(unknown.clone()));
+        assert_eq!(queue.submit(stranger, 0, played(0), at(0)), Err(unknown));
+    }
     assert!(later > 4096, "{later}");
 }
 

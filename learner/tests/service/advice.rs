@@ -267,13 +267,19 @@ async fn a_new_run_warns_of_an_account_that_a_run_of_the_same_name_has_used() {
     let (_, teacher) = calm(advised(0, AMPLE)).await;
     let address = teacher.serve().await;
     let directory = tempfile::tempdir().expect("a directory");
-    for (resume, expected) in [
-        (false, "the teacher's account \"toy\" was used before, 252 units are spent: "),
+    let used = "the teacher's account \"toy\" was used before, 252 units are spent: ";
+    for (resume, run_file, expected) in [
+        (false, None, used),
         // A run that ended before its first checkpoint has used the account itself.
-        (true, ""),
+        (true, None, ""),
+        // A supervisor's command starts a run and, the second time, continues it.
+        (true, Some("name = \"toy\""), used),
+        (true, Some("name = \"toy\""), ""),
     ] {
         let run = advised(0, AMPLE);
-        let served = Served::start(with_teacher(run, directory.path(), resume, address)).await;
+        let config = with_teacher(run, directory.path(), resume, address);
+        let run_file = run_file.map(str::to_owned);
+        let served = Served::start(LearnerConfig { run_file, ..config }).await;
         let mut toy = served.join("toy").await;
         let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
         let warning = progress.into_inner().warning;
@@ -315,6 +321,54 @@ async fn a_teacher_restarted_with_another_policy_is_warned_of() {
     assert!(text.starts_with(expected), "{text}");
     served.shutdown.cancel();
     served.end().await.expect("stopped");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_resumed_with_another_policy_of_its_teacher_is_warned_of() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    teacher.books().policy_digest = "5f3a".repeat(16);
+    let address = teacher.serve().await;
+    let mut run = advised(0, AMPLE);
+    run.stop.max_env_steps /= 2;
+    let served = Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    served.end().await.expect("the first half");
+    run.stop.max_env_steps *= 2;
+    let other =
+        "the teacher was restarted with another policy, 0b1c0b1c0b1c instead of 5f3a5f3a5f3a, ";
+    // However often the run is resumed, the policy counts with which it began.
+    for (policy, expected) in [("0b1c", other), ("0b1c", other), ("5f3a", "")] {
+        teacher.books().policy_digest = policy.repeat(16);
+        let config = with_teacher(run.clone(), directory.path(), true, address);
+        let served = Served::start(config).await;
+        let mut toy = served.join("toy").await;
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
+        let warning = progress.into_inner().warning;
+        assert_eq!(warning.is_empty(), expected.is_empty(), "{warning}");
+        assert!(warning.starts_with(expected), "{warning}");
+        served.shutdown.cancel();
+        served.end().await.expect("stopped");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_short_horizon_reserves_only_the_units_of_its_steps() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    // In the last round 76 units are left for four episodes of 20 guided steps each, of which each uses 7.
+    let spent = N_ADVISED * u64::from(UNITS);
+    let mut run = advised(0, spent + 48);
+    run.advice.strategy = "jsrl:20".to_owned();
+    let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    let ended = served.end().await.expect("a run");
+    let rows = Left::behind(&ended, directory.path()).rows;
+    let last = rows.last().expect("rows");
+    assert_eq!((last.advice_spent, last.budget_left), (spent, 48));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

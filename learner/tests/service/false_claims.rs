@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::Path;
+use std::time::Duration;
 
 use tandem_core::work::SlotOrder;
 use tandem_core::{Episode, EpisodeKind};
@@ -14,7 +15,7 @@ use tonic::{Code, Status};
 
 use crate::service_tests::advice::{advised, charge, with_teacher};
 use crate::service_tests::resume::copies_of;
-use crate::service_tests::run::{DEADLINE, Left, Served, Toy, VERSION, calm, learner_config};
+use crate::service_tests::run::{Left, Served, Toy, VERSION, calm, learner_config};
 use crate::service_tests::teacher::FakeTeacher;
 use crate::service_tests::toy::{UNITS, claim, config};
 
@@ -241,31 +242,29 @@ async fn ten_thousand_joins_do_not_keep_other_workers_out() {
     assert_eq!(Left::behind(&ended, directory.path()), expected);
 }
 
+/// Plays slots until the progress, which is published between rounds, shows workers of these names.
+async fn play_until_shown(toy: &mut Toy, names: &[&str]) {
+    loop {
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("it serves");
+        let workers = progress.into_inner().workers;
+        if workers.iter().map(|worker| worker.name.as_str()).eq(names.iter().copied()) {
+            return;
+        }
+        assert!(toy.play_one().await, "the run has ended");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn joins_end_with_their_connection() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(config(0), directory.path(), false)).await;
     let mut honest = served.join("honest").await;
     let mut flood = served.client().await;
-    let joined = join_by(&mut flood).await.expect("taken in");
+    join_by(&mut flood).await.expect("taken in");
+    play_until_shown(&mut honest, &["honest", "flood"]).await;
     drop(flood);
-    // The number is unknown as soon as the connection is seen to have ended.
-    let forgotten = async {
-        loop {
-            let request = pb::SubmitEpisodesRequest {
-                worker_id: joined,
-                slot: 0,
-                episodes: vec![],
-                environment_check: None,
-            };
-            let status = honest.client.submit_episodes(request).await.expect_err("no slot is out");
-            if status.code() == Code::NotFound {
-                return;
-            }
-            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
-        }
-    };
-    tokio::time::timeout(DEADLINE, forgotten).await.expect("in time");
+    play_until_shown(&mut honest, &["honest"]).await;
     served.shutdown.cancel();
     served.end().await.expect("interrupted");
 }

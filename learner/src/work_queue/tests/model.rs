@@ -104,18 +104,20 @@ impl Model {
         Ok(chosen)
     }
 
-    fn submit(&mut self, worker: u64, slot: u64) -> Result<bool, SubmitError> {
-        let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
-        (member.last_seen, member.silent, member.has_asked) = (self.now, false, true);
-        member.given = member.given.filter(|given| *given != slot);
+    fn submit(&mut self, worker: u64, slot: u64) -> bool {
+        // The episodes of a worker that was removed count too.
+        if let Some(member) = self.members.get_mut(&worker) {
+            (member.last_seen, member.silent, member.has_asked) = (self.now, false, true);
+            member.given = member.given.filter(|given| *given != slot);
+        }
         let open = self.slots.get_mut(&slot).filter(|slot| slot.place.is_open());
-        let Some(slot) = open else { return Ok(false) };
+        let Some(slot) = open else { return false };
         if let Place::Out { since, .. } = slot.place {
             let took = self.now - since;
             self.took = Some(self.took.map_or(took, |before| (7 * before + took) / 8));
         }
         slot.place = Place::In;
-        Ok(true)
+        true
     }
 
     fn reclaim(&mut self) -> Vec<(u64, usize)> {
@@ -189,7 +191,7 @@ impl Both {
         };
         let episodes = order.episodes.iter().map(episode).collect();
         let got = self.queue.submit(worker, slot, episodes, self.model.now);
-        assert_eq!(got, self.model.submit(worker, slot));
+        assert_eq!(got, Ok(self.model.submit(worker, slot)));
     }
 
     fn reclaim(&mut self) {
