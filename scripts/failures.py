@@ -1,6 +1,8 @@
 #!/usr/bin/env python3
 """How a policy with several arms fails: plays episodes and counts what the arms without success did.
 
+A goal is *raised* if it is more than the tolerance, 5 cm, above its object: it cannot be reached by pushing.
+
 An arm *touched* its object if the object ends more than 2 cm from its start, and is *at* it if its hand ends within
 5 cm of it. An arm that neither touched its object nor is at it has usually waited for another arm. The value is the
 mean of the critic's over these arms after half of the steps: without contacts, minus the discounted number of steps
@@ -53,13 +55,21 @@ def distances(some, others):
 
 
 def count(starts, ends, goals, hands, values, tolerance_m):
-    """Returns the failed episodes and, of the arms without success, how many touched their objects and are at them."""
+    """Returns the failed episodes, also by their raised goals, and, of the arms without success, how many touched their
+    objects and are at them."""
     failed = distances(ends, goals) > tolerance_m
+    n_raised = (goals[:, :, 2] - starts[:, :, 2] > tolerance_m).sum(axis=1)
+    by_raised = {
+        f"{counted} with {n} raised goals": int((is_counted & (n_raised == n)).sum())
+        for n in range(failed.shape[1] + 1)
+        for counted, is_counted in (("episodes", True), ("failed episodes", failed.any(axis=1)))
+    }
     touched, near = distances(starts, ends) > MOVED_M, distances(hands, ends) < NEAR_M
     waiting = failed & ~touched & ~near
     return {
         "episodes": len(failed),
         "failed episodes": int(failed.any(axis=1).sum()),
+        **by_raised,
         "arms without success": int(failed.sum()),
         "object not touched, hand away": int(waiting.sum()),
         "object not touched, hand at it": int((failed & ~touched & near).sum()),

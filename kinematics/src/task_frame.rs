@@ -1,6 +1,6 @@
 //! The relation between the training world's frames and the arms' base frames.
 //!
-//! **The training world** gives every number in an arm's own frame: origin on the table in the centre of the arm's
+//! **The classic training world** gives every number in an arm's own frame: origin on the table in the centre of the arm's
 //! workspace, x away from its base, z up, metres. The second arm's frame is the first's rotated by half a turn. Objects
 //! and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves within 0.20
 //! m, 0.25 m and 0.35 m. The gripper's fingers close along y.

@@ -128,7 +128,9 @@ impl VelocityDamper {
     }
 
     /// Returns the smallest gap between links, or links and hands, since the start of the control step, metres. It is
-    /// negative if they overlap, and exact only below [`ACTIVATION_DISTANCE_M`].
+    /// negative if they overlap, and meaningful only below [`ACTIVATION_DISTANCE_M`]. Within a control step it is a
+    /// prediction of first order from the posture at the step's start: a hand of the shared world moves up to 5 cm in a
+    /// step, in which a link of a Mico can be some millimetres from where it is predicted, 14 mm at most.
     pub(crate) fn min_gap_m(&self) -> f32 {
         self.min_gap_m
     }

@@ -23,7 +23,7 @@ pub struct MetricsRow {
     pub episodes: u64,
     /// Updates of the networks so far.
     pub updates: u64,
-    /// The paper's epochs so far, of 50 rounds each.
+    /// The paper's epochs so far, each of as many rounds as the setting `rounds.per_epoch` says, by default 50.
     pub paper_epochs: f64,
     /// Wall time of the run, seconds, summed over resumed parts.
     pub wall_s: f64,

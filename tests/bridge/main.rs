@@ -76,7 +76,7 @@ fn an_impossible_motion_is_refused_and_moves_nothing() {
         let status = bridge.status();
         let arms = status["arms"].as_array().expect("arms");
         let tools = arms.iter().filter_map(|arm| arm["tool_in_world_m"].as_array());
-        tools.flatten().filter_map(serde_json::Value::as_f64).collect()
+        tools.flatten().filter_map(Value::as_f64).collect()
     };
     let before_m = tools_m();
     assert_eq!(before_m.len(), 6, "{before_m:?}");

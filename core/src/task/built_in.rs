@@ -14,7 +14,8 @@ use crate::layout::{
 /// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
 /// they cannot touch. Hands move by at most 5 cm in a step of any world, and reach 3.5 cm ahead of their position.
 const RECOMBINATION_GAP_M: f32 = 0.10;
-/// The same in the plane, in the shared world: a hand is at most 0.12 m wide and moves up to 0.05 m per step.
+/// The same in the plane, in the shared world: a closed hand is at most 0.12 m wide and moves up to 0.05 m per step. An
+/// open hand is 0.144 m wide, so two that are open and side by side can come closer than their widths; that is rare.
 const SHARED_RECOMBINATION_GAP_M: f32 = 0.16;
 
 /// Number of steps for which a bar must be held at its goal.

@@ -78,8 +78,9 @@ fn all_later_steps_are_equally_likely_hindsight_goals() {
         if first.episode_idx != 0 || x >= 9.0 || first.step_idx > EPISODE_STEPS - 10 {
             return;
         }
-        let (step, goal) = (first.step_idx, (x / 0.01).round() as usize);
-        assert!((step + 1..=EPISODE_STEPS).contains(&goal), "{goal} after {step}");
+        let step = first.step_idx;
+        let is_goal = |later: &usize| (x - 0.01 * *later as f32).abs() < 0.005;
+        let goal = (step + 1..=EPISODE_STEPS).find(is_goal).expect("a later step");
         let is_late = 2 * (goal - step) > EPISODE_STEPS - step + 1;
         let is = [true, is_late, goal == step + 1, goal == EPISODE_STEPS];
         let mut now = counts.get();
