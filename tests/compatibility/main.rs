@@ -38,10 +38,26 @@ fn copy(file: &Path) -> (TempDir, PathBuf) {
     (directory, path)
 }
 
+/// The actions of the corpus's policies, observation 0.1 and goal 0.2 throughout, by `scripts/check_policy.py` in double
+/// precision.
+const ACTIONS: [(Task, usize, &[f32]); 4] = [
+    (Task::Push, 1, &[-0.978_658, 1.0, -0.997_690]),
+    (Task::Push, 2, &[0.999_971, 0.999_992, 0.960_273, 0.950_561, -0.999_918, -0.995_930]),
+    (Task::PickAndPlace, 1, &[-0.878_635, 0.999_974, -0.948_191, 0.976_435]),
+    (
+        Task::PickAndPlace,
+        2,
+        &[
+            0.999_996, 0.999_996, 0.015_032, 0.999_542, -0.999_414, -0.998_682, -0.999_683,
+            -0.981_547,
+        ],
+    ),
+];
+
 #[test]
 fn policies_are_read() {
     for version in versions() {
-        for (task, n_arms) in Task::CLASSIC.into_iter().flat_map(|task| [(task, 1), (task, 2)]) {
+        for (task, n_arms, expected) in ACTIONS {
             let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
             let policy = Policy::load(&path).expect("a policy");
             assert_eq!(policy.layout, Layout::new(task, n_arms).into(), "{path:?}");
@@ -50,7 +66,9 @@ fn policies_are_read() {
             let observation = vec![0.1; policy.layout.n_observation()];
             let mut actor = policy.actor().expect("usable");
             actor.act(&observation, &vec![0.2; policy.layout.n_goal()], &mut action);
-            assert!(action.iter().all(|x| x.abs() <= 1.0), "{path:?} acts {action:?}");
+            assert_eq!(action.len(), expected.len(), "{path:?}");
+            let agrees = action.iter().zip(expected).all(|(x, y)| (x - y).abs() < 1e-5);
+            assert!(agrees, "{path:?} acts {action:?}, not {expected:?}");
         }
     }
 }
