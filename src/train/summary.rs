@@ -7,6 +7,7 @@ use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
 use tandem_report::FilmStrip;
 use tandem_system::atomic_file;
+use tandem_telemetry::LogName;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
@@ -197,8 +198,10 @@ fn command_line((start, option): &(String, Option<String>)) -> String {
 /// Returns the first episode of the newest recorded evaluation.
 fn newest_log(out: &Path) -> Option<PathBuf> {
     let entries = std::fs::read_dir(out.join("mcap")).ok()?;
-    let logs = entries.filter_map(|entry| Some(entry.ok()?.path()));
-    logs.filter(|path| path.to_string_lossy().ends_with("-000.mcap")).max()
+    let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let logs = paths.filter_map(|path| Some((LogName::of(&path)?, path)));
+    let firsts = logs.filter(|(name, _)| name.is_evaluation && name.number == 0);
+    firsts.max().map(|(_, path)| path)
 }
 
 /// Prints the command that resumes an interrupted run.
@@ -258,6 +261,24 @@ fn summary_json(
 mod tests {
     use super::*;
     use crate::cli::EnvironmentArgs;
+
+    #[test]
+    fn the_newest_log_is_that_of_the_latest_round_with_any_number_of_digits() {
+        let out = tempfile::tempdir().expect("a directory");
+        assert_eq!(newest_log(out.path()), None);
+        let logs = out.path().join("mcap");
+        std::fs::create_dir(&logs).expect("a directory");
+        for name in [
+            "eval-999999-000.mcap",
+            "eval-1000000-000.mcap",
+            "eval-1000000-001.mcap",
+            "eval-2000000-000.mcap.part",
+            "train-3000000-000.mcap",
+        ] {
+            std::fs::write(logs.join(name), "").expect("writes");
+        }
+        assert_eq!(newest_log(out.path()), Some(logs.join("eval-1000000-000.mcap")));
+    }
 
     #[test]
     fn a_command_for_served_environments_names_the_server_and_is_not_broken_within_a_word() {
