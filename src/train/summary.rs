@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
-use tandem_report::FilmStrip;
+use tandem_report::{FilmStrip, run_summary};
 use tandem_system::atomic_file;
 use tandem_telemetry::LogName;
 
@@ -21,8 +21,6 @@ use crate::run_pages::RunPages;
 use crate::shell::shell_word;
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
 
-/// File in the run directory.
-const FILE: &str = "summary.json";
 /// Number of test goals from which on the report shows episodes of the test.
 const MIN_TEST_EPISODES_OF_FILMS: usize = 100;
 
@@ -52,14 +50,14 @@ pub(super) fn print(
 
 /// Writes the summary, from which reports take the success on test goals.
 fn save(out: &Path, summary: &str) -> Result<(), Failed> {
-    let path = out.join(FILE);
+    let path = out.join(run_summary::FILE);
     atomic_file::replace(&path, format!("{summary}\n").as_bytes())
         .or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 /// Removes the summary of a run that goes on.
 pub(super) fn remove(out: &Path) -> Result<(), Failed> {
-    let path = out.join(FILE);
+    let path = out.join(run_summary::FILE);
     match std::fs::remove_file(&path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             Err(error).or_cannot_write(|| format!("cannot remove {}", path.display()))
