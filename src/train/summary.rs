@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
+use tandem_core::Episode;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
 use tandem_report::{FilmStrip, run_summary};
@@ -32,7 +33,7 @@ pub(super) fn print(
     args: &TrainArgs,
 ) -> Result<(), Failed> {
     let saved = || format!("the run is complete and saved in {}", plan.out.display());
-    let result = test(plan, args).map_err(|failed| {
+    let (result, shown) = test(plan, args).map_err(|failed| {
         if failed.exit() == Exit::Interrupted {
             output::message(format_args!("{}; its test was interrupted", saved()));
         }
@@ -40,7 +41,8 @@ pub(super) fn print(
     })?;
     let json = summary_json(plan, last, memory, &result).to_string();
     save(&plan.out, &json).map_err(|failed| failed.context(saved()))?;
-    let (result, pages) = pages(plan, result, args).map_err(|failed| failed.context(saved()))?;
+    let (result, pages) =
+        pages(plan, (result, shown), args).map_err(|failed| failed.context(saved()))?;
     let summary = match args.json {
         true => json,
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
@@ -66,40 +68,47 @@ pub(super) fn remove(out: &Path) -> Result<(), Failed> {
     }
 }
 
-/// Plays the test goals with the best policy, on the server of the environments if the run has one.
-fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
+/// Plays the test goals with the best policy, on the server of the environments if the run has one. Returns the first
+/// episode of each outcome too.
+fn test(plan: &Plan, args: &TrainArgs) -> Result<(EvaluationResult, Vec<Episode>), Failed> {
     let (path, n_episodes) = (plan.best_policy(), plan.config.evaluation.test_episodes);
     let (policy, goals) = (policy_file::load(&path)?, (n_episodes, TEST_SEED));
     if names_server(&plan.environment) {
-        let subject = (Part::AllArms, &policy);
-        return measure_served(&plan.environment, subject, goals, args.exit_with_stdin);
+        let (subject, mut firsts) = ((Part::AllArms, &policy), Vec::new());
+        let mut take = |episodes: Vec<Episode>| film::keep_firsts(&mut firsts, &episodes);
+        let result =
+            measure_served(&plan.environment, subject, goals, &mut take, args.exit_with_stdin)?;
+        return Ok((result, firsts));
     }
     let subject = EvaluatedPolicy::new(policy, &path)?;
     signals::unless_interrupted(args.exit_with_stdin, move || {
-        measure(&subject, n_episodes, TEST_SEED)
+        let mut firsts = Vec::new();
+        let mut take = |episodes: Vec<Episode>| film::keep_firsts(&mut firsts, &episodes);
+        let result = measure(&subject, goals, &mut take)?;
+        Ok((result, firsts))
     })
 }
 
 /// Writes the pages of the run, which show episodes of the test.
 fn pages(
     plan: &Plan,
-    result: EvaluationResult,
+    (result, shown): (EvaluationResult, Vec<Episode>),
     args: &TrainArgs,
 ) -> Result<(EvaluationResult, RunPages), Failed> {
     let (config, out) = (plan.config.clone(), plan.out.clone());
     signals::unless_interrupted(args.exit_with_stdin, move || {
-        let pages = RunPages::write(&config, &out, &films(&result)?)?;
+        let pages = RunPages::write(&config, &out, &films(&result, &shown)?)?;
         Ok((result, pages))
     })
 }
 
-/// Draws the first success and the first failure of the test, if the simulator has the task. A test of few goals says
-/// little, and drawing would take longer than the test.
-fn films(result: &EvaluationResult) -> Result<Vec<FilmStrip>, Failed> {
+/// Draws the first success and the first failure of the test, which are among `shown`, if the simulator has the task. A
+/// test of few goals says little, and drawing would take longer than the test.
+fn films(result: &EvaluationResult, shown: &[Episode]) -> Result<Vec<FilmStrip>, Failed> {
     match result.task.as_built_in() {
-        Some(layout) if result.episodes.len() >= MIN_TEST_EPISODES_OF_FILMS => {
+        Some(layout) if result.summary.n_episodes >= MIN_TEST_EPISODES_OF_FILMS => {
             let films = film::OUTCOMES.into_iter().filter_map(|outcome| {
-                film::of_outcome(layout, TEST_SEED, &result.episodes, outcome).transpose()
+                film::of_outcome(layout, TEST_SEED, shown, outcome).transpose()
             });
             films.collect()
         }
