@@ -178,8 +178,8 @@ pub(crate) fn measure(
     Ok(outcomes.result(task, digest))
 }
 
-/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is the
-/// number of episodes, and the seed of their starts and goals.
+/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is
+/// the number of episodes, and the seed of their starts and goals.
 pub(crate) fn measure_perturbed(
     policy: &Policy,
     layout: Layout,

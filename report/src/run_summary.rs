@@ -16,8 +16,8 @@ pub struct RunLength {
 
 /// Returns whether `summary` is that of the run as it is now.
 ///
-/// A learner that extends a run without `tandem train`, and an extension that is interrupted at once, leave the summary of
-/// the shorter run. A summary of an earlier version that lacks its length counts as current.
+/// A learner that extends a run without `tandem train`, and an extension that is interrupted at once, leave the summary
+/// of the shorter run. A summary of an earlier version that lacks its length counts as current.
 #[must_use]
 pub fn is_current(summary: &Value, run: RunLength) -> bool {
     let of_summary = |key: &str| summary.get(key).and_then(Value::as_u64);

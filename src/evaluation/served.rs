@@ -23,8 +23,8 @@ pub(crate) enum Part {
 
 /// Evaluates a policy in the environments of a server.
 ///
-/// `goals` is the number of episodes, and the seed from which the server derives their starts and goals. Signals interrupt
-/// the evaluation and, if `exit_with_stdin`, the end of standard input.
+/// `goals` is the number of episodes, and the seed from which the server derives their starts and goals. Signals
+/// interrupt the evaluation and, if `exit_with_stdin`, the end of standard input.
 pub(crate) fn measure_served(
     environment: &EnvironmentArgs,
     (part, policy): (Part, &Policy),

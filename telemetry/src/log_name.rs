@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-/// A log's kind and numbers, as in its name. The order is that of age within a kind, training episodes and motions before
-/// evaluations. The order of the names as texts differs from it once a number outgrows its digits.
+/// A log's kind and numbers, as in its name. The order is that of age within a kind, training episodes and motions
+/// before evaluations. The order of the names as texts differs from it once a number outgrows its digits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LogName {
     /// Whether the episode belongs to an evaluation.

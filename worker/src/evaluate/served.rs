@@ -15,8 +15,8 @@ use crate::rollout::{RolloutError, play_slot};
 /// The largest number of episodes that are stepped in lock step. It does not affect the result.
 const MAX_EPISODES: usize = 16;
 
-/// Plays `n_episodes` episodes of `task`, numbered from 0, in the environments of a server, and calls `take` with some of
-/// them at a time, in order. `seed` determines their starts and goals.
+/// Plays `n_episodes` episodes of `task`, numbered from 0, in the environments of a server, and calls `take` with some
+/// of them at a time, in order. `seed` determines their starts and goals.
 ///
 /// After a failure of the server the episodes in play are repeated from their starts, as a worker does.
 ///
