@@ -1,26 +1,22 @@
 //! `tandem eval`: evaluates a policy on fixed goals.
 
 mod baselines;
+mod files;
 mod robustness;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use tandem_core::text::counted;
-use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms};
-use tandem_core::{
-    AdviceTerms, Episode, EvaluationSummary, Exploration, Layout, TaskSpec, Wilson, WorldSettings,
-};
-use tandem_picture::FilmEpisode;
-use tandem_worker::record::{RecordError, log_name, metadata_of, record_episode};
+use tandem_core::{EvaluationSummary, TaskSpec, Wilson};
 
-use crate::cli::{EvalArgs, OutcomeName, check_layout, check_n_arms, check_task, chosen_task};
+use crate::cli::{EvalArgs, check_layout, check_n_arms, check_task, chosen_task};
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
-use crate::exit::{Exit, Failed, OrExit as _};
+use crate::exit::{Failed, OrExit as _};
 use crate::film::PlannedFilm;
-use crate::{film, live, output, policy_file};
+use crate::{live, output, policy_file};
 use baselines::Baselines;
+use files::EpisodeFiles;
 use robustness::Robustness;
 
 pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
@@ -39,73 +35,16 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     if args.robustness {
         return Robustness::measure(args, &subject)?.print(args);
     }
-    let result = measure(&subject, args.episodes, args.seed)?;
+    let mut files = EpisodeFiles::new(args, &subject);
+    let goals = (args.episodes, args.seed);
+    let result = measure(&subject, goals, &mut |episodes| files.take(&episodes))?;
     let baselines = Baselines::measure(args, &subject)?;
-    let terms = terms(&subject);
-    let save = || {
-        if let (Some(path), Some(first)) = (&args.record, result.episodes.first()) {
-            record(&subject, &terms, args.seed, first, path)?;
-        }
-        if let Some(directory) = &args.record_dir {
-            record_all(&subject, &terms, args.seed, &result.episodes, directory)?;
-        }
-        film.map_or(Ok(()), |film| film.write(&filmed(args, subject.layout(), &result.episodes)?))
-    };
-    let saved = save();
+    let saved = files.finish(film);
     // Also if a file could not be written: the evaluation may have taken hours.
     print(args, &result, &baselines)?;
-    saved?;
+    let logs = saved?;
     print_files(args)?;
-    let Some(address) = args.live.live else { return Ok(()) };
-    // Viewers see logs: without a directory for them, they are temporary.
-    let temporary = std::env::temp_dir().join(format!("tandem-live-{}", std::process::id()));
-    let directory = args.record_dir.as_ref().unwrap_or(&temporary);
-    let recorded = match args.record_dir {
-        Some(_) => Ok(()),
-        None => record_all(&subject, &terms, args.seed, &result.episodes, directory),
-    };
-    let logs: Vec<PathBuf> =
-        result.episodes.iter().map(|episode| directory.join(log_name(episode))).collect();
-    let served = recorded.and_then(|()| live::serve(address, &logs));
-    drop(std::fs::remove_dir_all(temporary));
-    served
-}
-
-/// Writes the logs of all episodes of an evaluation with `seed` to `directory`.
-fn record_all(
-    subject: &EvaluatedPolicy,
-    terms: &RunTerms,
-    seed: u64,
-    episodes: &[Episode],
-    directory: &Path,
-) -> Result<(), Failed> {
-    std::fs::create_dir_all(directory)
-        .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
-    episodes.par_iter().try_for_each(|episode| {
-        record(subject, terms, seed, episode, &directory.join(log_name(episode)))
-    })
-}
-
-/// Returns the episodes that the film shows.
-fn filmed(
-    args: &EvalArgs,
-    layout: Layout,
-    episodes: &[Episode],
-) -> Result<Vec<FilmEpisode>, Failed> {
-    let is_shown = |episode: &&Episode| match args.film_outcome {
-        None => true,
-        Some(OutcomeName::Success) => episode.succeeded(),
-        Some(OutcomeName::Failure) => !episode.succeeded(),
-    };
-    let n_shown = usize::try_from(args.film_episodes).unwrap_or(usize::MAX);
-    let shown: Vec<&Episode> = episodes.iter().filter(is_shown).take(n_shown).collect();
-    if shown.is_empty() {
-        return Err(Failed::usage(format!(
-            "--film-outcome: none of {} episodes has this outcome; try more --episodes or another --seed",
-            episodes.len()
-        )));
-    }
-    shown.into_iter().map(|episode| film::of_evaluation(layout, args.seed, episode)).collect()
+    args.live.live.map_or(Ok(()), |address| live::serve(address, logs.paths()))
 }
 
 /// Evaluates a policy in the environments of a server.
@@ -132,7 +71,7 @@ fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
     let policy = policy_file::load(path)?;
     check_required(args, &policy.layout, part)?;
     let goals = (args.episodes, args.seed);
-    let result = measure_served(&args.environment, (part, &policy), goals, false)?;
+    let result = measure_served(&args.environment, (part, &policy), goals, &mut |_| {}, false)?;
     print(args, &result, &Baselines::none())
 }
 
@@ -169,49 +108,11 @@ fn share_text(summary: &EvaluationSummary, share: f64) -> String {
     format!("{share:.3} [{low:.3}, {high:.3}]")
 }
 
-/// Returns the terms of an evaluation, for the metadata of its logs.
-fn terms(subject: &EvaluatedPolicy) -> RunTerms {
-    RunTerms {
-        run: String::new(),
-        layout: subject.layout().into(),
-        account: None,
-        advice: AdviceTerms::default(),
-        exploration: Exploration::NONE,
-        world: WorldSettings::default(),
-        symmetrized_evaluation: false,
-    }
-}
-
 /// Checks that a log may replace what is at `path`: a file, and not a directory, a device or a pipe.
 fn check_record(path: &Path) -> Result<(), Failed> {
     match std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
         true => Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file"))),
         false => output::check_directory_of(path),
-    }
-}
-
-/// Writes the log of one episode of an evaluation with `seed`.
-fn record(
-    subject: &EvaluatedPolicy,
-    terms: &RunTerms,
-    seed: u64,
-    episode: &Episode,
-    path: &Path,
-) -> Result<(), Failed> {
-    let number = episode.number;
-    let order = EpisodeOrder {
-        number,
-        seed,
-        advised: false,
-        exploration: EpisodeExploration::Noise,
-        record: true,
-        advised_steps: None,
-    };
-    let metadata = metadata_of(order, episode, terms, subject.policy().digest());
-    match record_episode(&metadata, episode, path) {
-        Ok(_) => Ok(()),
-        Err(error @ RecordError::Log(_)) => Err(error).or_cannot_write(String::new),
-        Err(error) => Err(Failed::new(Exit::Bug, error)),
     }
 }
 

@@ -3,6 +3,7 @@
 mod served;
 
 use std::num::NonZeroUsize;
+use std::ops::Range;
 use std::path::Path;
 use std::time::Duration;
 
@@ -98,19 +99,19 @@ impl EvaluatedPolicy {
         ));
     }
 
-    /// Plays `n_episodes` episodes, whose goals are fixed by `seed`, on all cores.
-    pub(crate) fn play(&self, n_episodes: u64, seed: u64) -> Result<Vec<Episode>, Failed> {
+    /// Plays the episodes with these numbers, whose goals are fixed by `seed`, on all cores.
+    pub(crate) fn play(&self, numbers: Range<u64>, seed: u64) -> Result<Vec<Episode>, Failed> {
         let actor = self.policy().actor().or_exit(Exit::Data, String::new)?;
         let (layout, world) = (self.layout(), WorldConfig::default());
         let n_threads = n_threads();
         let episodes = match self {
-            Self::Policy(_) => evaluate(&actor, layout, &world, n_episodes, seed, n_threads),
+            Self::Policy(_) => evaluate(&actor, layout, &world, numbers, seed, n_threads),
             Self::Composed(..) => {
-                evaluate_composed(&actor, layout, &world, n_episodes, seed, n_threads)
+                evaluate_composed(&actor, layout, &world, numbers, seed, n_threads)
             }
             Self::Blind(policy) => {
                 let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
-                evaluate_blind(&blind, layout, &world, n_episodes, seed, n_threads)
+                evaluate_blind(&blind, layout, &world, numbers, seed, n_threads)
             }
         };
         episodes.or_exit(Exit::Bug, String::new)
@@ -151,41 +152,92 @@ fn evaluation_command(path: &Path) -> String {
     }
 }
 
-/// The episodes and the results of an evaluation.
+/// The result of an evaluation.
 pub(crate) struct EvaluationResult {
-    pub(crate) episodes: Vec<Episode>,
     pub(crate) task: TaskSpec,
     pub(crate) summary: EvaluationSummary,
     pub(crate) steps_per_s: f64,
     pub(crate) policy_digest: String,
 }
 
-/// Plays `n_episodes` episodes and summarizes them.
+/// Receives the episodes of an evaluation, some at a time, in the order of their numbers.
+pub(crate) type Take<'a> = &'a mut dyn FnMut(Vec<Episode>);
+
+/// Number of episodes that are in memory at once.
+const N_AT_ONCE: u64 = 2_000;
+
+/// Plays episodes and summarizes them. `goals` is the number of episodes, and the seed of their starts and goals.
 pub(crate) fn measure(
     subject: &EvaluatedPolicy,
-    n_episodes: u64,
-    seed: u64,
+    goals: (u64, u64),
+    take: Take<'_>,
 ) -> Result<EvaluationResult, Failed> {
-    let start = clock::now();
-    let episodes = subject.play(n_episodes, seed)?;
     let (task, digest) = (subject.layout().into(), subject.policy().digest());
-    Ok(EvaluationResult::of(episodes, task, digest, start.elapsed()))
+    let outcomes =
+        Outcomes::of_parts(goals.0, take, &mut |numbers| subject.play(numbers, goals.1))?;
+    Ok(outcomes.result(task, digest))
 }
 
-/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is the
-/// number of episodes, and the seed of their starts and goals.
+/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is
+/// the number of episodes, and the seed of their starts and goals.
 pub(crate) fn measure_perturbed(
     policy: &Policy,
     layout: Layout,
     conditions: (&WorldConfig, Perturbation),
-    (n_episodes, seed): (u64, u64),
+    goals: (u64, u64),
+    take: Take<'_>,
 ) -> Result<EvaluationResult, Failed> {
-    let start = clock::now();
     let actor = policy.actor().or_exit(Exit::Data, String::new)?;
     let n_threads = n_threads();
-    let episodes = evaluate_perturbed(&actor, layout, conditions, n_episodes, seed, n_threads)
-        .or_exit(Exit::Bug, String::new)?;
-    Ok(EvaluationResult::of(episodes, layout.into(), policy.digest(), start.elapsed()))
+    let outcomes = Outcomes::of_parts(goals.0, take, &mut |numbers| {
+        evaluate_perturbed(&actor, layout, conditions, numbers, goals.1, n_threads)
+            .or_exit(Exit::Bug, String::new)
+    })?;
+    Ok(outcomes.result(layout.into(), policy.digest()))
+}
+
+/// The outcomes of episodes that were played, and the time that this took.
+#[derive(Default)]
+struct Outcomes {
+    outcomes: Vec<EpisodeOutcome>,
+    n_steps: usize,
+    elapsed: Duration,
+}
+
+impl Outcomes {
+    /// Plays `n_episodes` episodes in parts, and calls `take` with each.
+    fn of_parts(
+        n_episodes: u64,
+        take: Take<'_>,
+        play: &mut dyn FnMut(Range<u64>) -> Result<Vec<Episode>, Failed>,
+    ) -> Result<Self, Failed> {
+        let mut outcomes = Self::default();
+        let mut first = 0;
+        while first < n_episodes {
+            let end = n_episodes.min(first + N_AT_ONCE);
+            let start = clock::now();
+            let episodes = play(first..end)?;
+            outcomes.elapsed += start.elapsed();
+            outcomes.add(&episodes);
+            take(episodes);
+            first = end;
+        }
+        Ok(outcomes)
+    }
+
+    fn add(&mut self, episodes: &[Episode]) {
+        self.n_steps += episodes.iter().map(Episode::n_steps).sum::<usize>();
+        self.outcomes.extend(episodes.iter().map(EpisodeOutcome::of));
+    }
+
+    fn result(self, task: TaskSpec, policy_digest: String) -> EvaluationResult {
+        EvaluationResult {
+            summary: EvaluationSummary::of(&self.outcomes),
+            steps_per_s: self.n_steps as f64 / self.elapsed.as_secs_f64(),
+            task,
+            policy_digest,
+        }
+    }
 }
 
 /// Returns the number of threads that play episodes.
@@ -194,24 +246,6 @@ fn n_threads() -> NonZeroUsize {
 }
 
 impl EvaluationResult {
-    /// Summarizes episodes of `task` that were played in `elapsed`.
-    fn of(
-        episodes: Vec<Episode>,
-        task: TaskSpec,
-        policy_digest: String,
-        elapsed: Duration,
-    ) -> Self {
-        let n_steps = episodes.iter().map(Episode::n_steps).sum::<usize>();
-        let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
-        Self {
-            summary: EvaluationSummary::of(&outcomes),
-            steps_per_s: n_steps as f64 / elapsed.as_secs_f64(),
-            episodes,
-            task,
-            policy_digest,
-        }
-    }
-
     pub(crate) fn json(&self) -> Value {
         let contacts = ContactMetrics::of(&self.summary);
         let reported = |rate: f64| self.task.reports_contacts().then_some(rate);
@@ -282,5 +316,28 @@ impl EvaluationResult {
         lines.push(format!("{lost}: achieved, not at the end"));
         lines.push(format!("mean return   {:.1}", summary.mean_return));
         lines
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_bounded_and_have_all_episodes_in_order() {
+        let layout = Layout::new(Task::Push, 1);
+        let mut numbers = Vec::new();
+        let mut take = |episodes: Vec<Episode>| {
+            assert!(episodes.len() as u64 <= N_AT_ONCE);
+            numbers.extend(episodes.iter().map(|episode| episode.number));
+        };
+        let n_episodes = 2 * N_AT_ONCE + 1;
+        let mut play = |numbers: Range<u64>| {
+            Ok(numbers.map(|number| Episode::zeros(layout, number)).collect())
+        };
+        let outcomes = Outcomes::of_parts(n_episodes, &mut take, &mut play).expect("nothing fails");
+        assert!(numbers.into_iter().eq(0..n_episodes));
+        let summary = outcomes.result(layout.into(), String::new()).summary;
+        assert_eq!(summary.n_episodes as u64, n_episodes);
     }
 }

@@ -94,6 +94,16 @@ pub(crate) fn strip(episodes: &[FilmEpisode]) -> Result<Vec<u8>, Failed> {
 /// Outcomes of episodes that reports show: the name, and whether it is a success.
 pub(crate) const OUTCOMES: [(&str, bool); 2] = [("success", true), ("failure", false)];
 
+/// Adds to `kept` the first episode of each outcome that it lacks.
+pub(crate) fn keep_firsts(kept: &mut Vec<Episode>, episodes: &[Episode]) {
+    for (_, is_success) in OUTCOMES {
+        let has_outcome = |episode: &&Episode| episode.succeeded() == is_success;
+        if !kept.iter().any(|episode| has_outcome(&episode)) {
+            kept.extend(episodes.iter().find(has_outcome).cloned());
+        }
+    }
+}
+
 /// Draws the first episode with this outcome in an evaluation with `seed`, if there is one.
 pub(crate) fn of_outcome(
     layout: Layout,
@@ -158,7 +168,23 @@ const fn has_held(n_succeeding: &mut usize, succeeds: bool, n_required: usize) -
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::Task;
+
     use super::*;
+
+    #[test]
+    fn the_first_episode_of_each_outcome_is_kept() {
+        let episode = |number: u64, is_success: bool| {
+            let mut episode = Episode::zeros(Layout::new(Task::Push, 1), number);
+            episode.goal.fill(if is_success { 0.0 } else { 1.0 });
+            episode
+        };
+        let mut kept = Vec::new();
+        keep_firsts(&mut kept, &[episode(0, false), episode(1, false)]);
+        keep_firsts(&mut kept, &[episode(2, false), episode(3, true), episode(4, true)]);
+        keep_firsts(&mut kept, &[episode(5, true), episode(6, false)]);
+        assert_eq!(kept.iter().map(|episode| episode.number).collect::<Vec<_>>(), [0, 3]);
+    }
 
     #[test]
     fn a_goal_is_achieved_once_it_has_held_for_the_steps_that_count() {

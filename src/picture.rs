@@ -20,7 +20,7 @@ pub(crate) fn picture(args: &PictureArgs) -> Result<(), Failed> {
         (None, Some(path)) => EvaluatedPolicy::composed(policy_file::load(path)?, (None, 2), path)?,
         (None, None) => return Err(Failed::usage("give --policy or --composed-teachers")),
     };
-    let episode = subject.play(1, args.seed)?.remove(0);
+    let episode = subject.play(0..1, args.seed)?.remove(0);
     let film = film::of_evaluation(subject.layout(), args.seed, &episode)?;
     let step = film.steps.get(args.step as usize).or_else(|| film.steps.last());
     let step = step.ok_or_else(|| Failed::usage("the episode has no steps"))?;

@@ -116,7 +116,7 @@ fn baselines(args: &ReportArgs, runs: &[Run]) -> Result<Vec<Baseline>, Failed> {
         let teacher = policy_file::load(path)?;
         for task in advised_tasks(runs, teacher.layout.name()) {
             let composed = EvaluatedPolicy::composed(teacher.clone(), (task, 2), path)?;
-            let result = measure(&composed, TEST_EPISODES, TEST_SEED)?;
+            let result = measure(&composed, (TEST_EPISODES, TEST_SEED), &mut |_| {})?;
             let label = format!("composed {}", stem(path));
             baselines.push(Baseline { label, test: test_evaluation(&composed, &result) });
         }
@@ -160,7 +160,7 @@ fn films(args: &ReportArgs) -> Result<Vec<FilmStrip>, Failed> {
     let mut films = Vec::new();
     for (path, n) in args.film_strips.iter().zip(1..) {
         let subject = EvaluatedPolicy::new(policy_file::load(path)?, path)?;
-        let episodes = subject.play(TEST_EPISODES, TEST_SEED)?;
+        let episodes = subject.play(0..TEST_EPISODES, TEST_SEED)?;
         for outcome in film::OUTCOMES {
             match film::of_outcome(subject.layout(), TEST_SEED, &episodes, outcome)? {
                 Some(strip) => films.push(FilmStrip {

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use serde_json::Value;
+use tandem_report::run_summary::{self, RunLength};
+use tandem_rl::RunConfig;
 use tandem_system::{DirectoryLock, regular_file};
 
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -68,28 +70,31 @@ impl Display for RunState {
 
 /// Returns the summary that `tandem train` has written for the run in `out`, if there is one.
 pub(crate) fn summary(out: &Path) -> Option<Value> {
-    let bytes = regular_file::read(&out.join("summary.json")).ok()?;
+    let bytes = regular_file::read(&out.join(run_summary::FILE)).ok()?;
     serde_json::from_slice(&bytes).ok().filter(Value::is_object)
+}
+
+/// Returns how far the run in `out` with this configuration is, if that is valid.
+pub(crate) fn length(out: &Path, run: Option<&RunConfig>) -> RunLength {
+    let saved = saved_round(out).zip(run);
+    RunLength {
+        max_env_steps: run.map(|run| run.stop.max_env_steps),
+        env_steps: saved.map(|(round, run)| round * run.env_steps_per_round()),
+    }
 }
 
 /// Returns how far the run in `out` is.
 pub(crate) fn state(out: &Path) -> RunState {
-    let limit = run_file::resolve(Some(&out.join("run.toml")), &[])
-        .map(|run| (run.stop.max_env_steps, run.env_steps_per_round()));
-    // The learner of a run that was extended without `tandem train` leaves the summary of the shorter one.
-    let is_of_length = |summary: &Value| {
-        let of_run = summary.get("max_env_steps").and_then(Value::as_u64);
-        of_run.is_none_or(|of_run| limit.as_ref().is_ok_and(|(limit, _)| *limit == of_run))
-    };
-    if summary(out).is_some_and(|summary| is_of_length(&summary)) {
+    let config = run_file::resolve(Some(&out.join("run.toml")), &[]).ok();
+    let length = length(out, config.as_ref());
+    if summary(out).is_some_and(|summary| run_summary::is_current(&summary, length)) {
         return RunState::Complete;
     }
-    match (saved_round(out), limit) {
-        (None, _) => RunState::NotSaved,
-        (Some(round), Ok((limit, per_round))) if limit > 0 && round * per_round >= limit => {
-            RunState::NotTested
-        }
-        (Some(round), _) => RunState::Saved(round),
+    let RunLength { max_env_steps, env_steps } = length;
+    match saved_round(out) {
+        None => RunState::NotSaved,
+        Some(_) if max_env_steps > Some(0) && env_steps >= max_env_steps => RunState::NotTested,
+        Some(round) => RunState::Saved(round),
     }
 }
 

@@ -42,7 +42,7 @@ pub(crate) fn scene(args: &SceneArgs) -> Result<(), Failed> {
     let env = Env::new(layout, &WorldConfig::default()).or_exit(Exit::Usage, String::new)?;
     let episodes = match (&policy, &args.actions) {
         (Some(policy), _) => {
-            policy.play(args.episodes, args.seed)?.iter().map(PrintedEpisode::of).collect()
+            policy.play(0..args.episodes, args.seed)?.iter().map(PrintedEpisode::of).collect()
         }
         (None, Some(path)) => {
             let text =

@@ -110,12 +110,11 @@ async fn show(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Shows the progress until the run has ended: live on a terminal, elsewhere a line for each evaluation and every half
-/// minute, or each message as JSON.
+/// Shows the progress until the run has ended: live on a terminal, elsewhere as [`PlainLines`] or each message as JSON.
 async fn watch(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
     let call = learner.client.watch(pb::WatchRequest {});
     let mut stream = call_with_timeout(call, learner.advice).await?;
-    let (mut printed_round, mut printed_at_s) = (None, f64::NEG_INFINITY);
+    let mut plain = PlainLines::default();
     let is_live = !args.json && output::is_terminal();
     let mut display = is_live.then(|| Display::new(false));
     loop {
@@ -132,14 +131,8 @@ async fn watch(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
             output::print(progress_json(&progress))?;
         } else if let Some(display) = &mut display {
             display.show(&progress);
-        } else if let Some(evaluation) = progress.evaluation.as_ref()
-            && printed_round != Some(evaluation.round)
-        {
-            (printed_round, printed_at_s) = (Some(evaluation.round), progress.wall_s);
-            output::print(evaluation_line(&progress, evaluation))?;
-        } else if progress.wall_s - printed_at_s >= LINE_EVERY_S {
-            printed_at_s = progress.wall_s;
-            output::print(counts_line(&progress))?;
+        } else {
+            plain.of(&progress).iter().try_for_each(output::print)?;
         }
         if progress.ended {
             display.iter_mut().for_each(Display::close);
@@ -148,6 +141,38 @@ async fn watch(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
             }
             return Ok(());
         }
+    }
+}
+
+/// The progress without a terminal: a line for each evaluation, for each warning and its end, and every half minute.
+#[derive(Default)]
+struct PlainLines {
+    /// Round of the latest evaluation.
+    round: Option<u64>,
+    /// Run time of the latest evaluation or counts, seconds.
+    at_s: Option<f64>,
+    warning: String,
+}
+
+impl PlainLines {
+    /// Returns the lines about `progress` that are new.
+    fn of(&mut self, progress: &pb::Progress) -> Vec<String> {
+        let mut lines = Vec::new();
+        if progress.warning != self.warning {
+            self.warning.clone_from(&progress.warning);
+            lines.push(warning_line(progress));
+        }
+        let is_due = self.at_s.is_none_or(|at_s| progress.wall_s - at_s >= LINE_EVERY_S);
+        if let Some(evaluation) = progress.evaluation.as_ref()
+            && self.round != Some(evaluation.round)
+        {
+            (self.round, self.at_s) = (Some(evaluation.round), Some(progress.wall_s));
+            lines.push(evaluation_line(progress, evaluation));
+        } else if is_due {
+            self.at_s = Some(progress.wall_s);
+            lines.push(counts_line(progress));
+        }
+        lines
     }
 }
 
@@ -225,5 +250,28 @@ mod tests {
         );
         let ended = pb::Progress { ended: true, end_reason: "done".to_owned(), ..progress };
         assert_eq!(lines(&ended).last().map(String::as_str), Some("ended: done"));
+    }
+
+    #[test]
+    fn without_a_terminal_warnings_and_their_ends_are_lines_too() {
+        let mut plain = PlainLines::default();
+        let mut check = |wall_s: f64, warning: &str, round: Option<u64>, expected: &[&str]| {
+            let evaluation =
+                round.map(|round| pb::Evaluation { round, success: 0.5, ..Default::default() });
+            let warning = warning.to_owned();
+            let progress = pb::Progress { wall_s, warning, evaluation, ..Default::default() };
+            let lines = plain.of(&progress);
+            assert_eq!(lines.len(), expected.len(), "{lines:?}");
+            for (line, word) in lines.iter().zip(expected) {
+                assert!(line.contains(word), "{line:?} lacks {word:?}");
+            }
+        };
+        check(0.0, "", None, &["0 updates"]);
+        check(1.0, "the disk is full", None, &["00:01 warning: the disk is full"]);
+        check(2.0, "the disk is full", None, &[]);
+        check(3.0, "a worker is silent", Some(4), &["a worker is silent", "success 0.500"]);
+        check(4.0, "", Some(4), &["00:04 the problem is solved"]);
+        check(32.0, "", Some(4), &[]);
+        check(33.0, "", Some(4), &["0 updates"]);
     }
 }

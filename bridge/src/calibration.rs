@@ -20,6 +20,7 @@ use tandem_kinematics::{Joints, WorkCell};
 
 use crate::cell_file::ArmTiming;
 use crate::driver::{Command, Driver, DriverError, Order, PairState, SILENCE_S};
+use crate::ending;
 use crate::executor::{
     BadSetting, Executor, Phase, ResetError, Settings, StartError, Stop, StopCause, Token,
 };
@@ -91,8 +92,11 @@ pub enum CalibrationError {
     #[error("the arms were stopped: {0}")]
     Stopped(Stop),
     /// The operator interrupted the measurement.
-    #[error("interrupted: the arms are stopped")]
+    #[error("interrupted")]
     Interrupted,
+    /// The arms have not confirmed the order to stop at the end. Holds the error before it, if there was one.
+    #[error("{}", ending::unconfirmed(.0.as_deref()))]
+    StopUnconfirmed(Option<Box<Self>>),
     /// The joint did not move as commanded, so nothing can be measured.
     #[error("joint {} of arm {} did not move as commanded", .joint + 1, .arm.0)]
     NotMoving {
@@ -158,7 +162,8 @@ pub struct Operator<'a> {
 /// speed, see [`SPEED_SHARES`]), within the limits of `settings`. Returns the times of each arm.
 ///
 /// # Errors
-/// Returns the reason why the arms could not be measured. They are stopped then.
+/// Returns the reason why the arms could not be measured. They are stopped then, unless the error is
+/// [`CalibrationError::StopUnconfirmed`], which replaces the times of measured arms too.
 ///
 /// # Panics
 /// Panics if `speed` is not within [`SPEED_SHARES`].
@@ -186,17 +191,11 @@ pub fn calibrate(
         ticked_s: at_s,
         delayed_s: f64::NEG_INFINITY,
     };
-    let mut timings = Vec::with_capacity(cell.arms.len());
-    for (arm, placed) in cell.arms.iter().enumerate() {
-        let mut joints = Vec::with_capacity(placed.model.n_joints());
-        for joint in 0..placed.model.n_joints() {
-            let timing = bench.measure(arm, joint, speed)?;
-            report(JointTiming { arm: ArmIndex(arm), joint, timing });
-            joints.push(timing);
-        }
-        timings.push(of_arm(&joints, bench.executor.period_s()));
+    let measured = bench.measure_arms(speed, report);
+    match ending::stop(&mut bench.executor, clock) {
+        true => measured,
+        false => Err(CalibrationError::StopUnconfirmed(measured.err().map(Box::new))),
     }
-    Ok(timings)
 }
 
 /// Returns the times of an arm with these joints.
@@ -231,6 +230,25 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
+    /// Measures all arms, and reports the times of each joint.
+    fn measure_arms(
+        &mut self,
+        speed: f64,
+        report: &mut dyn FnMut(JointTiming),
+    ) -> Result<Vec<ArmTiming>, CalibrationError> {
+        let mut timings = Vec::with_capacity(self.cell.arms.len());
+        for (arm, placed) in self.cell.arms.iter().enumerate() {
+            let mut joints = Vec::with_capacity(placed.model.n_joints());
+            for joint in 0..placed.model.n_joints() {
+                let timing = self.measure(arm, joint, speed)?;
+                report(JointTiming { arm: ArmIndex(arm), joint, timing });
+                joints.push(timing);
+            }
+            timings.push(of_arm(&joints, self.executor.period_s()));
+        }
+        Ok(timings)
+    }
+
     /// Measures a joint.
     fn measure(
         &mut self,
@@ -288,7 +306,6 @@ impl Bench<'_> {
     /// Sends a command and receives a state at the next period.
     fn tick(&mut self) -> Result<Phase, CalibrationError> {
         if (self.is_interrupted)() {
-            self.executor.shut_down(self.clock.now_s());
             return Err(CalibrationError::Interrupted);
         }
         self.at_s = next_time(self.at_s, self.executor.period_s(), self.clock.now_s());

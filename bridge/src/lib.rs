@@ -15,6 +15,7 @@
 pub mod calibration;
 pub mod cell_file;
 pub mod driver;
+mod ending;
 pub mod executor;
 pub mod injection;
 pub mod kinova_ros;

@@ -11,6 +11,7 @@
 use tandem_kinematics::{ArmSample, Joints, Motion, WorkCell};
 
 use crate::driver::{DriverError, PairState};
+use crate::ending;
 use crate::executor::{
     BadSetting, CheckError, CheckedMotion, Checker, Executor, Phase, Progress, ResetError,
     Settings, StartError, Stop, Token,
@@ -71,8 +72,11 @@ pub enum ToStartError {
     #[error("the arms were stopped: {0}")]
     Stopped(Stop),
     /// The operator interrupted.
-    #[error("interrupted: the arms are stopped")]
+    #[error("interrupted")]
     Interrupted,
+    /// The arms have not confirmed the order to stop at the end. Holds the error before it, if there was one.
+    #[error("{}", ending::unconfirmed(.0.as_deref()))]
+    StopUnconfirmed(Option<Box<Self>>),
 }
 
 /// The caller's side: its clock, its output and its interruption.
@@ -91,7 +95,8 @@ pub struct Operator<'a> {
 /// `settings` except the tilt. The arms are stopped afterwards.
 ///
 /// # Errors
-/// Returns the reason why the arms are not at the start. They are stopped then.
+/// Returns the reason why the arms are not at the start. They are stopped then, unless the error is
+/// [`ToStartError::StopUnconfirmed`], which arms at the start may cause too.
 pub fn to_start(
     cell: &WorkCell,
     driver: BoxDriver,
@@ -105,8 +110,10 @@ pub fn to_start(
     let Operator { clock, announce, report, is_interrupted } = operator;
     let mut arms = Arms { executor, clock, is_interrupted, at_s };
     let moved = arms.run(start, announce, report);
-    arms.executor.shut_down(clock.now_s());
-    moved
+    match ending::stop(&mut arms.executor, clock) {
+        true => moved,
+        false => Err(ToStartError::StopUnconfirmed(moved.err().map(Box::new))),
+    }
 }
 
 struct Arms<'a> {

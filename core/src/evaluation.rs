@@ -102,9 +102,11 @@ impl Wilson {
         let centre = share + Z * Z / (2.0 * n);
         let spread = Z * (share * (1.0 - share) / n + Z * Z / (4.0 * n * n)).sqrt();
         let scale = 1.0 + Z * Z / n;
+        // Centre and spread are equal without successes, and so are their distances from 1 without failures: rounding
+        // would leave a difference.
         Self {
-            low: ((centre - spread) / scale).max(0.0),
-            high: ((centre + spread) / scale).min(1.0),
+            low: if n_hits == 0 { 0.0 } else { ((centre - spread) / scale).max(0.0) },
+            high: if n_hits == n_trials { 1.0 } else { ((centre + spread) / scale).min(1.0) },
         }
     }
 }
@@ -211,6 +213,15 @@ mod tests {
         check(5, 10, 0.2366, 0.7634);
         check(240, 240, 0.9842, 1.0);
         check(0, 0, 0.0, 1.0);
+    }
+
+    #[test]
+    fn without_successes_or_failures_a_bound_of_the_wilson_interval_is_exact() {
+        for n_trials in 1..=1000 {
+            let (none, all) = (Wilson::of(0, n_trials), Wilson::of(n_trials, n_trials));
+            assert_eq!((none.low, all.high), (0.0, 1.0), "{n_trials}");
+            assert!(none.high < 1.0 && all.low > 0.0, "{n_trials}");
+        }
     }
 
     fn outcome(

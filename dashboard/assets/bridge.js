@@ -15,6 +15,8 @@ const MARGINS = [0.16, 0.3];
 let state = null;
 let logVersion = null;
 let link = "connecting";
+/** Time of the stop that the page shows as confirmed, seconds since the start of the bridge; null if it shows none. */
+let confirmedAt_s = null;
 
 /** Stops the arms. It uses nothing that the page has received, so it works before the first state and without events. */
 async function stop() {
@@ -23,6 +25,7 @@ async function stop() {
   button.classList.add("pressed");
   result.className = "stop-result";
   setText(result, "Stopping …");
+  confirmedAt_s = null;
   // Not `AbortSignal.timeout`, which old browsers lack: the request must be sent in any case.
   const abort = new AbortController();
   const timer = setTimeout(() => abort.abort(), STOP_TIMEOUT_MS);
@@ -41,6 +44,7 @@ async function stop() {
     if (typeof answer.stopped !== "string") throw new Error("the answer is not a bridge's");
     result.className = "stop-result confirmed";
     setText(result, `Stopped ${answer.stopped}`);
+    confirmedAt_s = answer.time_s;
   } catch (error) {
     const problem = error.name === "AbortError" ? "no answer" : error.message;
     result.className = "stop-result failed";
@@ -223,10 +227,11 @@ async function showLog(version) {
 }
 
 function show(s) {
-  // The message about a stop disappears with the reset that ends it.
-  const wasStopped = Boolean(state?.stop);
+  // The message about a stop disappears with the reset that ends it, even if no state with that stop has arrived.
+  const wasStopped = Boolean(state?.stop) || (confirmedAt_s !== null && s.time_s > confirmedAt_s);
   state = s;
   if (wasStopped && !s.stop) {
+    confirmedAt_s = null;
     byId("stop-result").className = "stop-result";
     setText(byId("stop-result"), "");
   }

@@ -25,5 +25,5 @@ mod sweep;
 pub use access::Access;
 pub use bridge::BridgeTerms;
 pub use server::{MAX_VIEWERS, serve};
-pub use site::{Site, StopAction, StopResult};
+pub use site::{ConfirmedStop, Site, StopAction, StopResult};
 pub use sweep::{RunPace, SweepResult, SweepRunState, SweepRunView, SweepView};

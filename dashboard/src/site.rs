@@ -13,6 +13,7 @@ use axum::routing::{get, post};
 use axum::{Extension, Router};
 use http::StatusCode;
 use http::header::CONTENT_TYPE;
+use serde::Serialize;
 use tokio::sync::{Semaphore, watch};
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::WatchStream;
@@ -26,8 +27,17 @@ const KEEP_ALIVE: Duration = Duration::from_secs(5);
 /// Time after which browsers open a stream again that has ended.
 const RETRY_AFTER: Duration = Duration::from_millis(200);
 
-/// The result of a stop: the description of the stop that the arms are in, or of the problem.
-pub type StopResult = Result<String, String>;
+/// The stop that the arms are in, as pages receive it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct ConfirmedStop {
+    /// Description of the stop.
+    pub stopped: String,
+    /// Time since the start of the bridge, seconds. A later state without a stop is that of arms that were reset.
+    pub time_s: f64,
+}
+
+/// The result of a stop: the stop that the arms are in, or the description of the problem.
+pub type StopResult = Result<ConfirmedStop, String>;
 /// Stops the arms.
 pub type StopAction =
     Arc<dyn Fn() -> Pin<Box<dyn Future<Output = StopResult> + Send>> + Send + Sync>;
@@ -155,7 +165,7 @@ async fn events(
 async fn stop(State(served): State<Served>) -> Response {
     let Some(action) = &served.site.stop else { return not_found() };
     match action().await {
-        Ok(stopped) => json(encode(&BTreeMap::from([("stopped", stopped)])).as_ref().to_owned()),
+        Ok(stopped) => json(encode(&stopped).as_ref().to_owned()),
         Err(problem) => {
             let body = encode(&BTreeMap::from([("problem", problem)]));
             (StatusCode::SERVICE_UNAVAILABLE, json(body.as_ref().to_owned())).into_response()

@@ -11,6 +11,7 @@ use toml::{Table, Value};
 
 use crate::error::Error;
 use crate::files::{read_if_present, read_rows};
+use crate::run_summary::{self, RunLength};
 use crate::test_evaluation::TestEvaluation;
 
 /// A run as reports see it.
@@ -41,9 +42,9 @@ impl Run {
         let teacher = teacher_of(dir);
         let mut run =
             Self { name: directory_name(dir), rows, configuration, teacher, ..Self::default() };
-        let summary = dir.join("summary.json");
+        let summary = dir.join(run_summary::FILE);
         if summary.exists() {
-            match TestEvaluation::load_summary(&summary, run.max_env_steps()) {
+            match TestEvaluation::load_summary(&summary, run.length()) {
                 Ok(test) => run.test = test,
                 Err(error) => warnings.push(error.to_string()),
             }
@@ -95,11 +96,15 @@ impl Run {
         settings
     }
 
-    /// Returns the number of environment steps after which the run ends, from the configuration; 0 for a run that ends
-    /// otherwise.
-    fn max_env_steps(&self) -> Option<u64> {
-        let max_env_steps = self.settings().get("stop")?.get("max_env_steps")?.as_integer()?;
-        u64::try_from(max_env_steps).ok()
+    /// Returns how far the run is, from its configuration and its last evaluation.
+    fn length(&self) -> RunLength {
+        let max_env_steps = || {
+            let settings = self.settings();
+            let max_env_steps = settings.get("stop")?.get("max_env_steps")?.as_integer()?;
+            u64::try_from(max_env_steps).ok()
+        };
+        let env_steps = self.last().map(|last| last.env_steps);
+        RunLength { max_env_steps: max_env_steps(), env_steps }
     }
 
     /// Returns the name of the task, from the configuration or, for a built-in task, else from the run's name.

@@ -7,6 +7,7 @@ use tandem_telemetry::ContactMetrics;
 
 use crate::error::Error;
 use crate::files::{read_error, read_text};
+use crate::run_summary::{self, RunLength};
 
 /// The evaluation of a policy on test goals, which no run uses to select its best policy.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,21 +42,20 @@ impl TestEvaluation {
             .map_err(|problem| Error::InvalidEvaluation { path: path.to_owned(), problem })
     }
 
-    /// Reads the summary of a run that ends after `max_env_steps` environment steps, if this is known.
+    /// Reads the summary of a run that is as far as `run`.
     ///
-    /// Returns `None` for a run without test goals, whose summary has no success, and for the summary of a shorter run,
-    /// which remains when a learner without `tandem train` extends the run.
+    /// Returns `None` for a run without test goals, whose summary has no success, and for a summary that is not
+    /// [current](run_summary::is_current).
     ///
     /// # Errors
     /// If the file cannot be read, or its last line is not a summary.
-    pub fn load_summary(path: &Path, max_env_steps: Option<u64>) -> Result<Option<Self>, Error> {
+    pub fn load_summary(path: &Path, run: RunLength) -> Result<Option<Self>, Error> {
         let text = read_text(path).map_err(read_error(path))?;
         let problem = |problem| Error::InvalidEvaluation { path: path.to_owned(), problem };
         let object = last_object(&text).map_err(problem)?;
         let is_summary = object.get("digest").is_some();
-        let length = object.get("max_env_steps").and_then(Value::as_u64);
-        let is_of_shorter = length.zip(max_env_steps).is_some_and(|(of, now)| of != now);
-        if is_summary && (is_of_shorter || object.get("success").is_none()) {
+        let is_old = !run_summary::is_current(&object, run);
+        if is_summary && (is_old || object.get("success").is_none()) {
             return Ok(None);
         }
         Self::of(&object).map(Some).map_err(problem)
@@ -146,7 +146,7 @@ mod tests {
         let path = dir.path().join("summary.json");
         let load = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            TestEvaluation::load_summary(&path, None)
+            TestEvaluation::load_summary(&path, RunLength::default())
         };
         let served = r#"{"task":"lab/reach","arms":2,"env_steps":2400,"digest":"5f3a"}"#;
         assert_eq!(load(served).unwrap(), None);
@@ -163,8 +163,10 @@ mod tests {
         let of_2400 = r#""digest":"5f3a","max_env_steps":2400,"collision_rate""#;
         std::fs::write(&path, LINE.replace('\n', "").replace(r#""collision_rate""#, of_2400))
             .unwrap();
-        let has_test =
-            |max_env_steps| TestEvaluation::load_summary(&path, max_env_steps).unwrap().is_some();
+        let has_test = |max_env_steps| {
+            let run = RunLength { max_env_steps, env_steps: None };
+            TestEvaluation::load_summary(&path, run).unwrap().is_some()
+        };
         assert!(has_test(Some(2400)) && has_test(None));
         assert!(!has_test(Some(4800)));
     }

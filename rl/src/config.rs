@@ -252,7 +252,7 @@ pub struct EvaluationConfig {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct StopConfig {
-    /// Success rate of an evaluation, in [0, 1].
+    /// Success rate of an evaluation, in [0, 1]. Contacts do not count against it.
     pub until_success: f64,
     /// Environment steps of training. A run file that gives minutes and no steps drops the recipe's steps.
     pub max_env_steps: u64,

@@ -11,7 +11,7 @@ use tandem_system::atomic_file;
 use tokio_util::sync::CancellationToken;
 
 use super::cell::{self, Cell};
-use super::first_day::confirm;
+use super::first_day::{confirm, report_interruption};
 use super::{arms, priority, runtime};
 use crate::cli::{CalibrateArgs, DriverName};
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -97,14 +97,21 @@ fn measure_arms(
     let is_interrupted = || interrupted.is_cancelled();
     let operator =
         Operator { clock: &*clock, report: &mut report, is_interrupted: &is_interrupted };
-    measure(&work_cell, driver, settings, args.speed, operator).map_err(|error| {
-        let exit = match &error {
-            CalibrationError::Interrupted => Exit::Interrupted,
-            CalibrationError::Setting(_) => Exit::Data,
-            _ => Exit::TryAgain,
-        };
-        Failed::new(exit, anyhow::Error::new(error).context("the cell file is unchanged"))
-    })
+    measure(&work_cell, driver, settings, args.speed, operator).map_err(measuring_failed)
+}
+
+fn measuring_failed(error: CalibrationError) -> Failed {
+    use CalibrationError as E;
+    let exit = match &error {
+        E::Interrupted => Exit::Interrupted,
+        E::StopUnconfirmed(Some(first)) if **first == E::Interrupted => Exit::Interrupted,
+        E::Setting(_) => Exit::Data,
+        _ => Exit::TryAgain,
+    };
+    if exit == Exit::Interrupted {
+        report_interruption(&error, error == E::Interrupted);
+    }
+    Failed::new(exit, anyhow::Error::new(error).context("the cell file is unchanged"))
 }
 
 fn times(timing: &ArmTiming) -> String {
@@ -117,6 +124,18 @@ mod tests {
     use tandem_bridge::cell_file::DEFAULT_TEXT;
 
     use super::*;
+
+    #[test]
+    fn an_interruption_is_one_even_if_the_stop_is_not_confirmed() {
+        use CalibrationError as E;
+        let unconfirmed = |first: E| E::StopUnconfirmed(Some(Box::new(first)));
+        let interrupted = measuring_failed(unconfirmed(E::Interrupted));
+        assert_eq!(interrupted.exit(), Exit::Interrupted);
+        assert!(interrupted.line().contains("interrupted; the arms have not confirmed"));
+        let failed = measuring_failed(E::StopUnconfirmed(None));
+        assert_eq!(failed.exit(), Exit::TryAgain);
+        assert!(failed.line().ends_with("within 1 s: use the emergency stop"), "{}", failed.line());
+    }
 
     #[test]
     fn edits_during_the_measurement_are_kept() {

@@ -1,5 +1,6 @@
 //! `tandem bridge home` and `tandem bridge to-start`: what arms need before their first motion.
 
+use std::fmt::Display;
 use std::io::{BufRead as _, IsTerminal as _};
 use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -141,17 +142,31 @@ fn move_arms(
         report: &mut report,
         is_interrupted: &|| interrupted.is_cancelled(),
     };
-    move_to_start(&work_cell, driver, settings, &start, operator).map_err(|error| {
-        let exit = match &error {
-            ToStartError::Interrupted => Exit::Interrupted,
-            ToStartError::Setting(_) | ToStartError::NoWay(_) => Exit::Data,
-            _ => Exit::TryAgain,
-        };
-        if exit == Exit::Interrupted {
-            output::message("tandem: interrupted: the arms are stopped");
-        }
-        Failed::new(exit, anyhow::Error::new(error).context("the arms are not at their start"))
-    })
+    move_to_start(&work_cell, driver, settings, &start, operator).map_err(to_start_failed)
+}
+
+fn to_start_failed(error: ToStartError) -> Failed {
+    use ToStartError as E;
+    let exit = match &error {
+        E::Interrupted => Exit::Interrupted,
+        E::StopUnconfirmed(Some(first)) if **first == E::Interrupted => Exit::Interrupted,
+        E::Setting(_) | E::NoWay(_) => Exit::Data,
+        _ => Exit::TryAgain,
+    };
+    if exit == Exit::Interrupted {
+        report_interruption(&error, error == E::Interrupted);
+    }
+    let place = match &error {
+        E::StopUnconfirmed(None) => "the arms are at their start",
+        _ => "the arms are not at their start",
+    };
+    Failed::new(exit, anyhow::Error::new(error).context(place))
+}
+
+/// Reports the interruption of a command that has moved the arms: the program prints no error that ends in one.
+pub(super) fn report_interruption(error: &impl Display, is_stopped: bool) {
+    let arms = if is_stopped { ": the arms are stopped" } else { "" };
+    output::message(format_args!("tandem: {error}{arms}"));
 }
 
 /// Runs `work` on a thread of its own, with a token that is cancelled by Ctrl-C and SIGTERM.

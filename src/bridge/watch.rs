@@ -12,7 +12,7 @@ use std::time::Duration;
 use tandem_bridge::injection::Injector;
 use tandem_bridge::service::{Observer, Operator, Snapshots, observe};
 use tandem_core::text::error_chain;
-use tandem_dashboard::{Access, BridgeTerms, Site, StopAction};
+use tandem_dashboard::{Access, BridgeTerms, ConfirmedStop, Site, StopAction};
 use tandem_kinematics::WorkCell;
 use tandem_net::{ServerConfig, Token};
 use tandem_system::{DirectoryLock, atomic_file};
@@ -238,7 +238,9 @@ fn stop_action(operator: Operator) -> StopAction {
         Box::pin(async move {
             tracing::info!("the stop button of the page was pressed");
             let stopped = operator.stop().await.map_err(|error| error_chain(&error))?;
-            Ok(stopped.map(|stop| stop.to_string()).unwrap_or_default())
+            let stopped = stopped
+                .map(|stop| ConfirmedStop { stopped: stop.to_string(), time_s: stop.when_s });
+            Ok(stopped.unwrap_or_default())
         })
     })
 }

@@ -51,7 +51,7 @@ pub(crate) struct StatusArgs {
     #[arg(value_name = "DIR|ADDR")]
     pub(crate) run: PathBuf,
     /// Follows the run until it ends, as `tandem train` shows it: with a progress bar on a terminal, elsewhere with a line for
-    /// each evaluation and one every half minute.
+    /// each evaluation and each warning, and one every half minute.
     #[arg(long)]
     pub(crate) watch: bool,
     /// Prints one JSON object; with --watch, one per message.

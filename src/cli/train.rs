@@ -89,7 +89,7 @@ pub(crate) struct TrainArgs {
     /// Seed of all random numbers [default: 1].
     #[arg(long, help_heading = SETTINGS, value_name = "N")]
     pub(crate) seed: Option<u64>,
-    /// Stops when an evaluation reaches this success rate, 0 to 1.
+    /// Stops when an evaluation reaches this success rate, 0 to 1; contacts do not count against it.
     #[arg(long, help_heading = END_OF_THE_RUN, value_name = "P")]
     pub(crate) until_success: Option<f64>,
     /// Stops after this many environment steps; 0 for no limit [default: the recipe's, none with --max-minutes].

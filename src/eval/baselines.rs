@@ -49,10 +49,11 @@ impl Baselines {
             )));
         }
         let blind = EvaluatedPolicy::Blind(policy.clone());
+        let goals = (args.episodes, args.seed);
         let subjects = [("composed teachers", composed), ("blind policy", blind)];
         let results = subjects
             .into_iter()
-            .map(|(name, subject)| Ok((name, measure(&subject, args.episodes, args.seed)?)));
+            .map(|(name, subject)| Ok((name, measure(&subject, goals, &mut |_| {})?)));
         results.collect::<Result<_, Failed>>().map(Self)
     }
 

@@ -39,7 +39,8 @@ impl Robustness {
         for Condition { name, world, perturbation } in conditions {
             progress.set_message(name.clone());
             let goals = (args.episodes, args.seed);
-            let result = measure_perturbed(policy, layout, (&world, perturbation), goals)?;
+            let result =
+                measure_perturbed(policy, layout, (&world, perturbation), goals, &mut |_| {})?;
             results.push((name, result));
             progress.inc(1);
         }
@@ -152,6 +153,8 @@ fn progress(n_conditions: usize) -> ProgressBar {
 mod tests {
     use std::path::Path;
 
+    use tandem_core::Episode;
+
     use super::*;
     use crate::evaluation::measure;
     use crate::policy_file;
@@ -163,9 +166,13 @@ mod tests {
         let subject = EvaluatedPolicy::new(policy.clone(), path).unwrap();
         let (layout, goals) = (subject.layout(), (6, 3));
         let episodes_under = |Condition { world, perturbation, .. }: &Condition| {
-            measure_perturbed(&policy, layout, (world, *perturbation), goals).unwrap().episodes
+            let (conditions, mut played) = ((world, *perturbation), Vec::new());
+            let mut take = |mut episodes: Vec<Episode>| played.append(&mut episodes);
+            measure_perturbed(&policy, layout, conditions, goals, &mut take).unwrap();
+            played
         };
-        let expected = measure(&subject, goals.0, goals.1).unwrap().episodes;
+        let mut expected = Vec::new();
+        measure(&subject, goals, &mut |mut episodes| expected.append(&mut episodes)).unwrap();
         let conditions = conditions(layout.task);
         assert_eq!(episodes_under(&conditions[0]), expected);
         for condition in &conditions[1..] {

@@ -5,7 +5,7 @@ use tandem_net::ClientConfig;
 use tandem_policy::Policy;
 use tandem_worker::{ComposedTeachers, EnvironmentConfig, ServedTask, evaluate_served};
 
-use super::EvaluationResult;
+use super::{EvaluationResult, Outcomes, Take};
 use crate::cli::EnvironmentArgs;
 use crate::environment_server::EnvironmentSource;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -23,12 +23,13 @@ pub(crate) enum Part {
 
 /// Evaluates a policy in the environments of a server.
 ///
-/// `n_episodes` episodes are played, whose starts and goals the server derives from `seed`. Signals interrupt the
-/// evaluation and, if `exit_with_stdin`, the end of standard input.
+/// `goals` is the number of episodes, and the seed from which the server derives their starts and goals. Signals
+/// interrupt the evaluation and, if `exit_with_stdin`, the end of standard input.
 pub(crate) fn measure_served(
     environment: &EnvironmentArgs,
     (part, policy): (Part, &Policy),
-    (n_episodes, seed): (u64, u64),
+    goals: (u64, u64),
+    take: Take<'_>,
     exit_with_stdin: bool,
 ) -> Result<EvaluationResult, Failed> {
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
@@ -36,7 +37,7 @@ pub(crate) fn measure_served(
         let interrupted = signals::shutdown_token(exit_with_stdin)?;
         let source = EnvironmentSource::of(environment, &ClientConfig::default())?;
         let measured = tokio::select! {
-            measured = measure(&source, (part, policy), (n_episodes, seed)) => measured,
+            measured = measure(&source, (part, policy), goals, take) => measured,
             () = interrupted.cancelled() => {
                 Err(Failed::new(Exit::Interrupted, anyhow::anyhow!("interrupted")))
             }
@@ -49,7 +50,8 @@ pub(crate) fn measure_served(
 async fn measure(
     source: &EnvironmentSource,
     (part, policy): (Part, &Policy),
-    (n_episodes, seed): (u64, u64),
+    goals: (u64, u64),
+    take: Take<'_>,
 ) -> Result<EvaluationResult, Failed> {
     let (Some(config), Some(served)) =
         (source.config(), source.served_task().await.map_err(worker_failed)?)
@@ -59,24 +61,29 @@ async fn measure(
         ));
     };
     check_task(part, policy, &served)?;
-    let start = clock::now();
-    let episodes = play(config, (part, policy), &served.task, (n_episodes, seed)).await?;
-    let elapsed = start.elapsed();
-    Ok(EvaluationResult::of(episodes, served.task, policy.digest(), elapsed))
+    let (start, mut outcomes) = (clock::now(), Outcomes::default());
+    let mut add = |episodes: Vec<Episode>| {
+        outcomes.add(&episodes);
+        take(episodes);
+    };
+    play(config, (part, policy), &served.task, goals, &mut add).await?;
+    outcomes.elapsed = start.elapsed();
+    Ok(outcomes.result(served.task, policy.digest()))
 }
 
 async fn play(
     config: EnvironmentConfig,
     (part, policy): (Part, &Policy),
     task: &TaskSpec,
-    (n_episodes, seed): (u64, u64),
-) -> Result<Vec<Episode>, Failed> {
+    goals: (u64, u64),
+    take: Take<'_>,
+) -> Result<(), Failed> {
     let actor = policy.actor().or_exit(Exit::Data, String::new)?;
     let played = match part {
-        Part::AllArms => evaluate_served(config, actor, task, n_episodes, seed).await,
+        Part::AllArms => evaluate_served(config, actor, task, goals, take).await,
         Part::EachArm(_) => {
             let composed = ComposedTeachers::new(actor, task);
-            evaluate_served(config, composed, task, n_episodes, seed).await
+            evaluate_served(config, composed, task, goals, take).await
         }
     };
     played.map_err(worker_failed)

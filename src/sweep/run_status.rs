@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
 use tandem_learner::checkpoint;
+use tandem_report::run_summary;
 use tandem_rl::RunConfig;
 use tandem_system::{atomic_file, regular_file};
 use tandem_teacher::policy::is_onnx;
@@ -84,7 +85,7 @@ impl RunStatus {
 }
 
 fn summary_path(dir: &Path) -> PathBuf {
-    dir.join("summary.json")
+    dir.join(run_summary::FILE)
 }
 
 fn failure_path(dir: &Path) -> PathBuf {
@@ -105,12 +106,8 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
         Ok(existing) => differences(existing, &run.config)?,
         Err(error) => vec![(String::new(), format!("{error:#}"))],
     };
-    let length = existing.as_ref().map_or(0, |existing| existing.stop.max_env_steps);
-    // An extension that was interrupted at once has left the summary of the shorter run.
-    let is_of_length = |summary: &Json| {
-        summary.get("max_env_steps").and_then(Json::as_u64).is_none_or(|of_run| of_run == length)
-    };
-    let summary = summary(dir)?.filter(is_of_length);
+    let length = run_directory::length(dir, existing.as_ref().ok());
+    let summary = summary(dir)?.filter(|summary| run_summary::is_current(summary, length));
     let has_same_teacher = same_teacher(run, dir);
     if differences.is_empty() && has_same_teacher {
         return Ok((summary.map_or(State::Started, State::Finished), None));
@@ -119,7 +116,8 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
         return Ok((State::New, None));
     }
     let planned_length = run.config.stop.max_env_steps;
-    let is_longer = length > 0 && planned_length > length;
+    let is_longer =
+        length.max_env_steps.is_some_and(|length| length > 0 && planned_length > length);
     if is_longer && has_same_teacher && differences.iter().all(|(key, _)| key == LENGTH) {
         return Ok((State::Started, Some(planned_length)));
     }

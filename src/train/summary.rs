@@ -3,10 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
+use tandem_core::Episode;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
-use tandem_report::FilmStrip;
+use tandem_report::{FilmStrip, run_summary};
 use tandem_system::atomic_file;
+use tandem_telemetry::LogName;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
@@ -20,8 +22,6 @@ use crate::run_pages::RunPages;
 use crate::shell::shell_word;
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
 
-/// File in the run directory.
-const FILE: &str = "summary.json";
 /// Number of test goals from which on the report shows episodes of the test.
 const MIN_TEST_EPISODES_OF_FILMS: usize = 100;
 
@@ -33,7 +33,7 @@ pub(super) fn print(
     args: &TrainArgs,
 ) -> Result<(), Failed> {
     let saved = || format!("the run is complete and saved in {}", plan.out.display());
-    let result = test(plan, args).map_err(|failed| {
+    let (result, shown) = test(plan, args).map_err(|failed| {
         if failed.exit() == Exit::Interrupted {
             output::message(format_args!("{}; its test was interrupted", saved()));
         }
@@ -41,7 +41,8 @@ pub(super) fn print(
     })?;
     let json = summary_json(plan, last, memory, &result).to_string();
     save(&plan.out, &json).map_err(|failed| failed.context(saved()))?;
-    let (result, pages) = pages(plan, result, args).map_err(|failed| failed.context(saved()))?;
+    let (result, pages) =
+        pages(plan, (result, shown), args).map_err(|failed| failed.context(saved()))?;
     let summary = match args.json {
         true => json,
         false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
@@ -51,14 +52,14 @@ pub(super) fn print(
 
 /// Writes the summary, from which reports take the success on test goals.
 fn save(out: &Path, summary: &str) -> Result<(), Failed> {
-    let path = out.join(FILE);
+    let path = out.join(run_summary::FILE);
     atomic_file::replace(&path, format!("{summary}\n").as_bytes())
         .or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 /// Removes the summary of a run that goes on.
 pub(super) fn remove(out: &Path) -> Result<(), Failed> {
-    let path = out.join(FILE);
+    let path = out.join(run_summary::FILE);
     match std::fs::remove_file(&path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             Err(error).or_cannot_write(|| format!("cannot remove {}", path.display()))
@@ -67,40 +68,47 @@ pub(super) fn remove(out: &Path) -> Result<(), Failed> {
     }
 }
 
-/// Plays the test goals with the best policy, on the server of the environments if the run has one.
-fn test(plan: &Plan, args: &TrainArgs) -> Result<EvaluationResult, Failed> {
+/// Plays the test goals with the best policy, on the server of the environments if the run has one. Returns the first
+/// episode of each outcome too.
+fn test(plan: &Plan, args: &TrainArgs) -> Result<(EvaluationResult, Vec<Episode>), Failed> {
     let (path, n_episodes) = (plan.best_policy(), plan.config.evaluation.test_episodes);
     let (policy, goals) = (policy_file::load(&path)?, (n_episodes, TEST_SEED));
     if names_server(&plan.environment) {
-        let subject = (Part::AllArms, &policy);
-        return measure_served(&plan.environment, subject, goals, args.exit_with_stdin);
+        let (subject, mut firsts) = ((Part::AllArms, &policy), Vec::new());
+        let mut take = |episodes: Vec<Episode>| film::keep_firsts(&mut firsts, &episodes);
+        let result =
+            measure_served(&plan.environment, subject, goals, &mut take, args.exit_with_stdin)?;
+        return Ok((result, firsts));
     }
     let subject = EvaluatedPolicy::new(policy, &path)?;
     signals::unless_interrupted(args.exit_with_stdin, move || {
-        measure(&subject, n_episodes, TEST_SEED)
+        let mut firsts = Vec::new();
+        let mut take = |episodes: Vec<Episode>| film::keep_firsts(&mut firsts, &episodes);
+        let result = measure(&subject, goals, &mut take)?;
+        Ok((result, firsts))
     })
 }
 
 /// Writes the pages of the run, which show episodes of the test.
 fn pages(
     plan: &Plan,
-    result: EvaluationResult,
+    (result, shown): (EvaluationResult, Vec<Episode>),
     args: &TrainArgs,
 ) -> Result<(EvaluationResult, RunPages), Failed> {
     let (config, out) = (plan.config.clone(), plan.out.clone());
     signals::unless_interrupted(args.exit_with_stdin, move || {
-        let pages = RunPages::write(&config, &out, &films(&result)?)?;
+        let pages = RunPages::write(&config, &out, &films(&result, &shown)?)?;
         Ok((result, pages))
     })
 }
 
-/// Draws the first success and the first failure of the test, if the simulator has the task. A test of few goals says
-/// little, and drawing would take longer than the test.
-fn films(result: &EvaluationResult) -> Result<Vec<FilmStrip>, Failed> {
+/// Draws the first success and the first failure of the test, which are among `shown`, if the simulator has the task. A
+/// test of few goals says little, and drawing would take longer than the test.
+fn films(result: &EvaluationResult, shown: &[Episode]) -> Result<Vec<FilmStrip>, Failed> {
     match result.task.as_built_in() {
-        Some(layout) if result.episodes.len() >= MIN_TEST_EPISODES_OF_FILMS => {
+        Some(layout) if result.summary.n_episodes >= MIN_TEST_EPISODES_OF_FILMS => {
             let films = film::OUTCOMES.into_iter().filter_map(|outcome| {
-                film::of_outcome(layout, TEST_SEED, &result.episodes, outcome).transpose()
+                film::of_outcome(layout, TEST_SEED, shown, outcome).transpose()
             });
             films.collect()
         }
@@ -197,8 +205,10 @@ fn command_line((start, option): &(String, Option<String>)) -> String {
 /// Returns the first episode of the newest recorded evaluation.
 fn newest_log(out: &Path) -> Option<PathBuf> {
     let entries = std::fs::read_dir(out.join("mcap")).ok()?;
-    let logs = entries.filter_map(|entry| Some(entry.ok()?.path()));
-    logs.filter(|path| path.to_string_lossy().ends_with("-000.mcap")).max()
+    let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let logs = paths.filter_map(|path| Some((LogName::of(&path)?, path)));
+    let firsts = logs.filter(|(name, _)| name.is_evaluation && name.number == 0);
+    firsts.max().map(|(_, path)| path)
 }
 
 /// Prints the command that resumes an interrupted run.
@@ -258,6 +268,24 @@ fn summary_json(
 mod tests {
     use super::*;
     use crate::cli::EnvironmentArgs;
+
+    #[test]
+    fn the_newest_log_is_that_of_the_latest_round_with_any_number_of_digits() {
+        let out = tempfile::tempdir().expect("a directory");
+        assert_eq!(newest_log(out.path()), None);
+        let logs = out.path().join("mcap");
+        std::fs::create_dir(&logs).expect("a directory");
+        for name in [
+            "eval-999999-000.mcap",
+            "eval-1000000-000.mcap",
+            "eval-1000000-001.mcap",
+            "eval-2000000-000.mcap.part",
+            "train-3000000-000.mcap",
+        ] {
+            std::fs::write(logs.join(name), "").expect("writes");
+        }
+        assert_eq!(newest_log(out.path()), Some(logs.join("eval-1000000-000.mcap")));
+    }
 
     #[test]
     fn a_command_for_served_environments_names_the_server_and_is_not_broken_within_a_word() {

@@ -15,6 +15,7 @@ pub mod events;
 pub mod live;
 mod log_budget;
 mod log_file;
+mod log_name;
 pub mod logging;
 mod messages;
 pub mod metrics;
@@ -34,6 +35,7 @@ pub use arms_view::{ArmView, ArmsEvents, ArmsPhase, ArmsView, MotionView, StopVi
 pub use episode_log::{EpisodeLog, LoggedTransition, read_episode};
 pub use error::Error;
 pub use log_budget::LogBudget;
+pub use log_name::LogName;
 pub use messages::EpisodeMetadata;
 pub use metrics::{ContactMetrics, MetricsLog, MetricsRow};
 pub use motion_journal::MotionJournal;

@@ -4,6 +4,7 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 use crate::error::Error;
+use crate::log_name::LogName;
 
 /// Share of the limit that remains occupied after logs were deleted, in eighths.
 const KEPT_EIGHTHS: u64 = 7;
@@ -92,9 +93,7 @@ impl LogBudget {
 /// A log in the directory. The order is that in which logs are deleted.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct LogEntry {
-    is_evaluation: bool,
-    parameter_version: u64,
-    episode: u64,
+    name: LogName,
     path: PathBuf,
     n_bytes: u64,
 }
@@ -104,36 +103,30 @@ fn read_logs(directory: &Path) -> Result<Vec<LogEntry>, Error> {
     let mut logs = Vec::new();
     for entry in entries {
         let entry = entry.map_err(Error::io("read", directory))?;
-        let name = entry.file_name();
-        let Some((is_evaluation, parameter_version, episode)) = name.to_str().and_then(parse_name)
-        else {
-            continue;
-        };
+        let path = entry.path();
+        let Some(name) = name_of(&path) else { continue };
         // A log that another process has just deleted or renamed occupies nothing.
         let Ok(metadata) = entry.metadata() else { continue };
-        let (path, n_bytes) = (entry.path(), metadata.len());
-        logs.push(LogEntry { is_evaluation, parameter_version, episode, path, n_bytes });
+        logs.push(LogEntry { name, path, n_bytes: metadata.len() });
     }
     Ok(logs)
 }
 
-/// Parses `train-VERSION-EPISODE.mcap`, `eval-VERSION-EPISODE.mcap`, `motion-DATE-NUMBER.mcap` or
-/// `stop-DATE-NUMBER.mcap`, with or without `.part`.
-fn parse_name(name: &str) -> Option<(bool, u64, u64)> {
-    let stem = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap")?;
-    let mut parts = stem.split('-');
-    let is_evaluation = match parts.next()? {
-        "train" | "motion" | "stop" => false,
-        "eval" => true,
-        _ => return None,
-    };
-    let numbers = (parts.next()?.parse().ok()?, parts.next()?.parse().ok()?);
-    parts.next().is_none().then_some((is_evaluation, numbers.0, numbers.1))
+/// Returns the name of a log, complete or not (`NAME.mcap.part`).
+fn name_of(path: &Path) -> Option<LogName> {
+    match is_incomplete(path) {
+        true => LogName::of(&path.with_extension("")),
+        false => LogName::of(path),
+    }
+}
+
+fn is_incomplete(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "part")
 }
 
 /// Returns whether a writer holds the lock of an incomplete log.
 fn is_being_written(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "part")
+    is_incomplete(path)
         && File::open(path)
             .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
 }

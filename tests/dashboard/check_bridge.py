@@ -2,9 +2,9 @@
 
 Starts a bridge with a simulated pair and uses its page as an operator does: the arms move on the page during a motion,
 the stop button stops the motion within a second and the page shows the cause, the keyboard reaches the button first,
-another page cannot press it, an injected fault is shown, values that arrive late count as old, a page whose address
-another one has taken is loaded again, nothing overflows on a phone, scripts have no errors. Prints the
-times that it measured.
+another page cannot press it, a confirmation disappears with the reset, an injected fault is shown, values that arrive
+late count as old, a page whose address another one has taken is loaded again, nothing overflows on a phone, scripts
+have no errors. Prints the times that it measured.
 """
 
 import argparse
@@ -231,15 +231,36 @@ def check_other_page(page):
     page.wait("window.former === undefined && document.getElementById('link')?.textContent === 'live'", "it is loaded again")
 
 
+def switch_hidden(page, is_hidden):
+    """Hides the page, or shows it again."""
+    page.value(f"Object.defineProperty(document, 'hidden', {{ value: {str(is_hidden).lower()}, configurable: true }}); "
+               "void document.dispatchEvent(new Event('visibilitychange'))")
+
+
 def check_hidden(page):
     """A hidden page leaves its connection to others, and has a new one when it is visible again."""
     link = "document.getElementById('link').textContent"
-    switch = ("Object.defineProperty(document, 'hidden', {{ value: {}, configurable: true }}); "
-              "void document.dispatchEvent(new Event('visibilitychange'))")
-    page.value(switch.format("true"))
+    switch_hidden(page, True)
     page.wait(f"{link}.includes('no connection') && document.title.startsWith('No connection')", "the page rests", 10)
-    page.value(switch.format("false"))
+    switch_hidden(page, False)
     page.wait(f"{link} === 'live' && !document.title.startsWith('No')", "the page is live again", 5)
+
+
+def check_reset_unseen(page, bridge):
+    """The confirmation of a stop disappears even if the page has seen neither the stop nor the reset that ended it."""
+    link = "document.getElementById('link').textContent"
+    phase = "document.getElementById('phase').textContent"
+    bridge.reset()
+    page.wait(f"{phase} === 'idle'", "the arms are idle", 5)
+    switch_hidden(page, True)
+    page.wait(f"{link}.includes('no connection')", "the page rests", 10)
+    page.value("void document.getElementById('stop').click()")
+    page.wait(CONFIRMED, "the page confirms the stop", 5)
+    bridge.reset()
+    switch_hidden(page, False)
+    page.wait(f"{link} === 'live'", "the page is live again", 5)
+    # A busy machine may stop the arms again.
+    page.wait(f"!{CONFIRMED} || {phase} === 'stopped'", "the confirmation disappears", 5)
 
 
 def main():
@@ -277,6 +298,7 @@ def main():
         check_other_page(other)
         page.show()
         check_hidden(page)
+        check_reset_unseen(page, bridge)
         bridge.process.send_signal(signal.SIGTERM)
         page.wait("document.getElementById('link').textContent.includes('no connection')", "the end is shown", 10)
         assert bridge.process.wait(20) == 0

@@ -4,6 +4,7 @@
 mod served;
 
 use std::num::NonZeroUsize;
+use std::ops::Range;
 
 use tandem_core::layout::Layout;
 use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms, SlotOrder};
@@ -52,7 +53,7 @@ impl<A: Act> Act for ComposedTeachers<A> {
     }
 }
 
-/// Plays `n_episodes` episodes, numbered from 0, and returns them by number. `seed` determines their starts and goals.
+/// Plays the episodes with these numbers, and returns them in order. `seed` determines their starts and goals.
 ///
 /// Each of `n_threads` threads has a world of its own. The result does not depend on their number.
 ///
@@ -62,11 +63,11 @@ pub fn evaluate(
     actor: &Actor,
     layout: Layout,
     world: &WorldConfig,
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|_| actor.clone(), layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(|_| actor.clone(), layout, world, numbers, seed, n_threads)
 }
 
 /// Plays episodes as [`evaluate`], with the one-arm policy `actor` acting for every arm of `layout`.
@@ -77,12 +78,12 @@ pub fn evaluate_composed(
     actor: &Actor,
     layout: Layout,
     world: &WorldConfig,
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
     let composed = |_| ComposedTeachers::new(actor.clone(), layout);
-    evaluate_simulated(composed, layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(composed, layout, world, numbers, seed, n_threads)
 }
 
 /// Plays episodes as [`evaluate`], with a policy whose arms do not see each other.
@@ -93,11 +94,11 @@ pub fn evaluate_blind(
     actor: &BlindActor,
     layout: Layout,
     world: &WorldConfig,
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|_| actor.clone(), layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(|_| actor.clone(), layout, world, numbers, seed, n_threads)
 }
 
 /// Plays episodes as [`evaluate`], with the errors of a perturbation between the policy and the arms.
@@ -108,12 +109,12 @@ pub fn evaluate_perturbed(
     actor: &Actor,
     layout: Layout,
     (world, perturbation): (&WorldConfig, Perturbation),
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
     let perturbed = |number| PerturbedActor::new(actor.clone(), layout, perturbation, seed, number);
-    evaluate_simulated(perturbed, layout, world, n_episodes, seed, n_threads)
+    evaluate_simulated(perturbed, layout, world, numbers, seed, n_threads)
 }
 
 /// Plays every episode with an actor of its own, that of its number.
@@ -121,24 +122,24 @@ fn evaluate_simulated<A: Act>(
     make_actor: impl Fn(u64) -> A + Sync,
     layout: Layout,
     world: &WorldConfig,
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
     let env = Env::new(layout, world).map_err(RolloutError::NoEnvironment)?;
     let terms = evaluation_terms(layout);
-    evaluate_in(&Simulator::new(env), make_actor, &terms, n_episodes, seed, n_threads)
+    evaluate_in(&Simulator::new(env), make_actor, &terms, numbers, seed, n_threads)
 }
 
 fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
     env: &E,
     make_actor: impl Fn(u64) -> A + Sync,
     terms: &RunTerms,
-    n_episodes: u64,
+    numbers: Range<u64>,
     seed: u64,
     n_threads: NonZeroUsize,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let numbers: Vec<u64> = (0..n_episodes).collect();
+    let numbers: Vec<u64> = numbers.collect();
     let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
     let play = |numbers: &[u64]| {
         let mut env = env.clone();
@@ -154,7 +155,8 @@ fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
             .map(|thread| thread.join().expect("a panicking rollout is a bug"))
             .collect()
     });
-    parts.into_iter().collect::<Result<Vec<_>, _>>().map(|parts| parts.concat())
+    let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
+    Ok(parts.into_iter().flatten().collect())
 }
 
 fn play_alone(
@@ -207,13 +209,13 @@ mod tests {
     use super::*;
     use crate::fakes::{FakeActor, FakeEnvironment, LAYOUT};
 
-    fn evaluate_fake(n_episodes: u64, seed: u64, n_threads: usize) -> Vec<Episode> {
+    fn evaluate_fake(numbers: Range<u64>, seed: u64, n_threads: usize) -> Vec<Episode> {
         let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
         evaluate_in(
             &FakeEnvironment::new(),
             |_| FakeActor::Seeker,
             &evaluation_terms(LAYOUT),
-            n_episodes,
+            numbers,
             seed,
             n_threads,
         )
@@ -222,21 +224,26 @@ mod tests {
 
     #[test]
     fn the_number_of_threads_changes_nothing() {
-        let alone = evaluate_fake(7, 5, 1);
+        let alone = evaluate_fake(0..7, 5, 1);
         assert_eq!(
             alone.iter().map(|episode| episode.number).collect::<Vec<_>>(),
             [0, 1, 2, 3, 4, 5, 6]
         );
         for n_threads in [2, 3, 7, 16] {
-            assert_eq!(evaluate_fake(7, 5, n_threads), alone, "{n_threads} threads");
+            assert_eq!(evaluate_fake(0..7, 5, n_threads), alone, "{n_threads} threads");
         }
         assert_eq!(
-            evaluate_fake(3, 5, 2),
+            evaluate_fake(0..3, 5, 2),
             alone[..3],
             "a smaller set is the beginning of a larger one"
         );
-        assert_ne!(evaluate_fake(7, 6, 1)[0].goal, alone[0].goal, "another seed has other goals");
-        assert!(evaluate_fake(0, 5, 2).is_empty());
+        assert_eq!(evaluate_fake(3..7, 5, 3), alone[3..], "a part is that of the whole");
+        assert_ne!(
+            evaluate_fake(0..7, 6, 1)[0].goal,
+            alone[0].goal,
+            "another seed has other goals"
+        );
+        assert!(evaluate_fake(0..0, 5, 2).is_empty());
     }
 
     #[test]
@@ -244,7 +251,8 @@ mod tests {
         let evaluate_on = |n_threads| {
             let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
             let (make_actor, world) = (|_| FakeActor::Seeker, WorldConfig::default());
-            evaluate_simulated(make_actor, LAYOUT, &world, 3, 5, n_threads).expect("no step fails")
+            evaluate_simulated(make_actor, LAYOUT, &world, 0..3, 5, n_threads)
+                .expect("no step fails")
         };
         assert_eq!(evaluate_on(1), evaluate_on(2));
     }

@@ -52,12 +52,20 @@ fn moved(
     start: &[Joints],
     n_periods: u32,
 ) -> (Result<(), ToStartError>, Option<f64>) {
+    moved_behind(Box::new(Shared(Arc::clone(pair))), start, n_periods)
+}
+
+/// As [`moved`], for the arms behind `driver`.
+fn moved_behind(
+    driver: BoxDriver,
+    start: &[Joints],
+    n_periods: u32,
+) -> (Result<(), ToStartError>, Option<f64>) {
     let (left, mut duration_s) = (Cell::new(n_periods), None);
     let is_interrupted = || {
         left.set(left.get().saturating_sub(1));
         left.get() == 0
     };
-    let driver: BoxDriver = Box::new(Shared(Arc::clone(pair)));
     let operator = Operator {
         clock: &SleepClock::default(),
         announce: &mut |motion: &Motion| duration_s = Some(motion.duration_s()),
@@ -132,4 +140,48 @@ fn a_start_without_a_checked_way_is_refused() {
         "{result:?}"
     );
     assert!(announced.is_none() && farthest_rad(&pair, &raised()) < 1e-3);
+}
+
+/// Arms that do not answer the orders to stop after a motion.
+struct Deaf {
+    pair: SharedPair,
+    newest: Option<PairState>,
+    has_moved: bool,
+}
+
+impl Driver for Deaf {
+    fn period_s(&self) -> f64 {
+        self.pair.lock().unwrap().period_s()
+    }
+
+    fn exchange(&mut self, command: &Command) -> Result<PairState, DriverError> {
+        self.has_moved |= matches!(command.order, Order::Move(_));
+        let state = self.pair.lock().unwrap().exchange(command)?;
+        match &self.newest {
+            Some(newest) if self.has_moved && command.order == Order::Stop => Ok(newest.clone()),
+            _ => Ok(self.newest.insert(state).clone()),
+        }
+    }
+
+    fn stop(&mut self) -> Result<(), DriverError> {
+        self.pair.lock().unwrap().stop()
+    }
+}
+
+#[test]
+fn a_stop_at_the_end_that_the_arms_do_not_confirm_is_reported() {
+    let start = mico_cell().ready(0.05).unwrap();
+    let moved_deaf = |n_periods| {
+        let pair = pair_at(&raised());
+        let driver: BoxDriver = Box::new(Deaf { pair, newest: None, has_moved: false });
+        moved_behind(driver, &start, n_periods).0
+    };
+    assert_eq!(moved_deaf(20_000), Err(ToStartError::StopUnconfirmed(None)));
+    let interrupted = moved_deaf(2000).unwrap_err();
+    let first = Some(Box::new(ToStartError::Interrupted));
+    assert_eq!(interrupted, ToStartError::StopUnconfirmed(first));
+    assert_eq!(
+        interrupted.to_string(),
+        "interrupted; the arms have not confirmed the order to stop within 1 s: use the emergency stop"
+    );
 }

@@ -13,7 +13,7 @@ use tokio::sync::watch;
 
 use super::*;
 use crate::bridge::BridgeTerms;
-use crate::site::StopAction;
+use crate::site::{ConfirmedStop, StopAction};
 
 /// Within this everything that is to happen has happened, on the slowest machine.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -247,10 +247,10 @@ async fn only_the_page_itself_and_programs_can_stop_the_arms_of_a_bridge() {
     let counter = Arc::clone(&pressed);
     let stop: StopAction = Arc::new(move || {
         let stopped = match counter.fetch_add(1, Ordering::Relaxed) {
-            0 => Ok("at 1.000 s"),
-            _ => Err("the drives are gone"),
+            0 => Ok(ConfirmedStop { stopped: "at 1.000 s".to_owned(), time_s: 1.0 }),
+            _ => Err("the drives are gone".to_owned()),
         };
-        Box::pin(async move { stopped.map(str::to_owned).map_err(str::to_owned) })
+        Box::pin(async move { stopped })
     });
     let site = Site::of_bridge(BridgeTerms::default(), receiver, stop);
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
@@ -272,7 +272,7 @@ async fn only_the_page_itself_and_programs_can_stop_the_arms_of_a_bridge() {
     assert_eq!(pressed.load(Ordering::Relaxed), 0);
     let stopped = served.ask("POST /stop", &format!("{action}origin: http://{address}\r\n")).await;
     has_status(&stopped, 200);
-    assert!(stopped.contains(r#"{"stopped":"at 1.000 s"}"#), "{stopped}");
+    assert!(stopped.contains(r#"{"stopped":"at 1.000 s","time_s":1.0}"#), "{stopped}");
     let failed = served.ask("POST /stop", action).await;
     has_status(&failed, 503);
     assert!(failed.contains("the drives are gone"), "{failed}");

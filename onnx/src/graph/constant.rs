@@ -82,7 +82,10 @@ impl<'a> Constant<'a> {
     /// Returns `width` finite numbers: those of a row, or one number repeated.
     pub(super) fn row(&self, width: usize) -> Result<Vec<f32>, ModelError> {
         let n = self.len()?;
-        let dims = &self.tensor.dims;
+        let mut dims = self.tensor.dims.clone();
+        if self.is_transposed {
+            dims.reverse();
+        }
         let is_row = dims.iter().rev().skip(1).all(|dimension| *dimension == 1);
         if !is_row || dims.len() > 2 || (n != 1 && n != width) {
             return Err(

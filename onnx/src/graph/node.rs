@@ -44,7 +44,15 @@ pub(super) fn interpret<'a>(
             };
             unchanged_if(interpreter, node, !trains, "inference (training_mode false)")
         }
-        "Flatten" => unchanged_if(interpreter, node, int(node, "axis", 1) == 1, "axis 1"),
+        "Flatten" => {
+            // It makes matrices of constants of other ranks.
+            let is_matrix = match value_of(interpreter, node, 0)? {
+                Value::Constant(constant) => constant.rank() == 2,
+                Value::Columns(_) | Value::Hidden { .. } => true,
+            };
+            let is_unchanged = is_matrix && int(node, "axis", 1) == 1;
+            unchanged_if(interpreter, node, is_unchanged, "axis 1 of a matrix")
+        }
         "Cast" => {
             let is_float = int(node, "to", 0) == i64::from(FLOAT);
             unchanged_if(interpreter, node, is_float, "a cast to float32")

@@ -53,6 +53,7 @@ fn model(nodes: &[&str]) -> ModelProto {
         tensor("wt", &[3, 2], &[1.0, 4.0, 2.0, 5.0, 3.0, 6.0]),
         tensor("c3", &[3], &[0.5, -0.5, 0.25]),
         tensor("c2", &[1, 2], &[2.0, 4.0]),
+        tensor("column", &[2, 1], &[2.0, 4.0]),
         tensor("zeros", &[2], &[0.0, 1.0]),
         tensor("one", &[], &[1.0]),
         tensor("minus", &[1], &[-1.0]),
@@ -97,6 +98,7 @@ fn operators_compute_what_onnx_defines() {
     check(&["Gemm a w _ -> h", "Clip h minus one -> y"], &[-1.0; 3]);
     check(&["Sub a c2 -> x", "Div x c2 -> z", "MatMul z w -> y"], &[-6.5, -8.5, -10.5]);
     check(&["Sub c2 a -> x", "MatMul x w -> y"], &[25.0, 32.0, 39.0]);
+    check(&["Transpose column -> t", "Sub t a -> x", "MatMul x w -> y"], &[25.0, 32.0, 39.0]);
     check(&["Max a one -> x", "Min x one -> z", "MatMul z w -> y"], &[5.0, 7.0, 9.0]);
     check(&["Concat b a axis=1 -> x", "MatMul x w4 -> y"], &[0.5 + 30.0 + 100.0 - 2000.0]);
     check(&["Clip a _ minus -> x", "Flatten x -> z", "MatMul z w -> y"], &[-9.0, -12.0, -15.0]);
@@ -145,6 +147,13 @@ fn a_refusal_names_the_node_its_operator_and_what_is_supported() {
     check(&["MatMul missing w -> y"], "computes its input \"missing\"");
     check(&["Add a nan -> x", "MatMul x w -> y"], "\"nan\": it holds a number that is not finite");
     check(&["Add a c3 -> x", "MatMul x w -> y"], "its shape is [3], expected one number or [2]");
+    for column in ["Transpose c2 -> c", "Identity column -> c"] {
+        check(&[column, "Add a c -> x", "MatMul x w -> y"], "its shape is [2, 1], expected");
+    }
+    check(
+        &["Flatten zeros -> c", "Add a c -> x", "MatMul x w -> y"],
+        "(Flatten): only axis 1 of a matrix is supported",
+    );
     check(&["Add a double -> x", "MatMul x w -> y"], "its type is number 11, expected 1 (float32)");
     check(&["MatMul a elsewhere -> y"], "external_data=False");
     check(&["MatMul a short -> y"], "it has 1 numbers, its shape is [2, 3]");

@@ -13,6 +13,7 @@ use foxglove::websocket::{ChannelView, Client, ServerListener};
 use super::episode::Episode;
 use super::{Clock, PAUSE_NS, Server, TICK};
 use crate::error::Error;
+use crate::log_name::LogName;
 
 /// Time between two looks into the directory.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -134,7 +135,7 @@ impl Follower {
     }
 }
 
-/// Logs with their inodes, in the order of their names: evaluations before training episodes.
+/// Logs with their inodes.
 type Logs = BTreeMap<PathBuf, u64>;
 
 /// Returns the finished logs in `directory`, `None` if it cannot be read.
@@ -146,18 +147,16 @@ fn logs_in(directory: &Path) -> Option<Logs> {
 
 /// Returns the first log of the newest evaluation among `new` or, without one, the newest training episode.
 fn next_log(new: &[PathBuf]) -> Option<&Path> {
-    let newest = new.iter().filter_map(|log| evaluation(log)).map(|(version, _)| version).max();
-    let mut of_newest = new
-        .iter()
-        .filter(|log| evaluation(log).is_some_and(|(version, _)| Some(version) == newest));
-    of_newest.next().or(new.last()).map(PathBuf::as_path)
+    let evaluations = || new.iter().filter_map(|log| Some((evaluation(log)?, log)));
+    let newest = evaluations().map(|(name, _)| name.version).max();
+    let first = evaluations().filter(|(name, _)| Some(name.version) == newest).min();
+    let first = first.map(|(_, log)| log);
+    first.or_else(|| new.iter().max_by_key(|log| LogName::of(log))).map(PathBuf::as_path)
 }
 
-/// Returns the parameter version and the episode of an evaluation's log, `eval-VERSION-EPISODE.mcap`; `None` for others.
-fn evaluation(log: &Path) -> Option<(u64, u64)> {
-    let name = log.file_stem()?.to_str()?.strip_prefix("eval-")?;
-    let (version, episode) = name.split_once('-')?;
-    Some((version.parse().ok()?, episode.parse().ok()?))
+/// Returns the name of an evaluation's log; `None` for others.
+fn evaluation(log: &Path) -> Option<LogName> {
+    LogName::of(log).filter(|name| name.is_evaluation)
 }
 
 #[cfg(test)]
@@ -177,6 +176,18 @@ mod tests {
         check(
             &["train-000001-000001.mcap", "train-000002-000009.mcap"],
             Some("train-000002-000009.mcap"),
+        );
+        check(
+            &["eval-1000000-000.mcap", "eval-1000000-1000.mcap", "eval-1000000-999.mcap"],
+            Some("eval-1000000-000.mcap"),
+        );
+        check(
+            &["eval-1000000-1000.mcap", "eval-1000000-999.mcap", "eval-999999-000.mcap"],
+            Some("eval-1000000-999.mcap"),
+        );
+        check(
+            &["train-1000000-000400.mcap", "train-999999-000400.mcap"],
+            Some("train-1000000-000400.mcap"),
         );
     }
 }

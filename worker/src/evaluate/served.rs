@@ -15,8 +15,8 @@ use crate::rollout::{RolloutError, play_slot};
 /// The largest number of episodes that are stepped in lock step. It does not affect the result.
 const MAX_EPISODES: usize = 16;
 
-/// Plays `n_episodes` episodes of `task`, numbered from 0, in the environments of a server and returns them by number.
-/// `seed` determines their starts and goals.
+/// Plays `n_episodes` episodes of `task`, numbered from 0, in the environments of a server, and calls `take` with some
+/// of them at a time, in order. `seed` determines their starts and goals.
 ///
 /// After a failure of the server the episodes in play are repeated from their starts, as a worker does.
 ///
@@ -26,18 +26,17 @@ pub async fn evaluate_served<A: Act + Clone + Send + 'static>(
     config: EnvironmentConfig,
     actor: A,
     task: &TaskSpec,
-    n_episodes: u64,
-    seed: u64,
-) -> Result<Vec<Episode>, Error> {
+    (n_episodes, seed): (u64, u64),
+    take: &mut dyn FnMut(Vec<Episode>),
+) -> Result<(), Error> {
     let mut environments = Environments::new(config);
     let n_per_slot = environments.check(task).await?.min(MAX_EPISODES);
     let terms = evaluation_terms(task);
-    let mut episodes = Vec::new();
     for first in (0..n_episodes).step_by(n_per_slot) {
         let order = slot_of((first..n_episodes).take(n_per_slot), seed);
-        episodes.append(&mut play(&mut environments, &actor, &order, &terms).await?);
+        take(play(&mut environments, &actor, &order, &terms).await?);
     }
-    Ok(episodes)
+    Ok(())
 }
 
 /// Plays a slot, and repeats it after failures of the server.
