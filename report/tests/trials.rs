@@ -63,12 +63,13 @@ fn the_table_has_successes_intervals_causes_and_the_papers_rows() {
     let expected = "\
 push: trials, as the paper's Table 4
 policy, mode                success  share [95 % interval]  median time
-student-push, closed-loop      2/10      20.0 % [5.7–51.0]       14.5 s
+student-push, closed-loop      2/11      18.2 % [5.1–47.7]       15.0 s
 student-push, open-loop         4/4   100.0 % [51.0–100.0]       11.5 s
 the paper, proposed method    40/50     80.0 % [67.0–88.8]            –
 the paper, from scratch        0/50        0.0 % [0.0–7.1]            –
 failures of student-push, closed-loop: 1 not-reached, 1 condition-unmet, 1
-object-lost, 1 timed-out, 1 arms-touched, 1 table-touched, 1 refused, 1 stopped
+object-lost, 1 timed-out, 1 arms-touched, 1 table-touched, 1 refused, 1
+not-rehearsed, 1 stopped
 ";
     assert_eq!(text, expected);
 }
@@ -208,13 +209,14 @@ fn the_page_plots_every_failure_and_lists_every_trial() {
     for (trial, cause) in trials::CAUSES.iter().rev().enumerate() {
         assert!(html.contains(&format!("push, trial {trial}: {cause}")), "{cause}");
     }
-    for number in 0..10 {
+    let n_trials = trials::CAUSES.len() + 2;
+    for number in 0..n_trials {
         assert!(html.contains(&format!("<td>trial-{number}.mcap</td>")), "{number}");
     }
     assert!(html.contains("Comparison of trials") && html.contains("Tables 2 and 4"));
     assert!(!html.contains("Table 2</h2>"), "the paper's Table 2 is about runs");
     let all = report_html(&comparison, &trials, PlottedTrials::All, &page).unwrap();
-    assert_eq!(all.plots.len(), 10);
+    assert_eq!(all.plots.len(), n_trials);
 }
 
 #[test]
@@ -239,14 +241,14 @@ fn repeated_trials_add_a_warning_and_keep_their_plots() {
 fn json_has_the_statistics_of_every_group() {
     let value = trials::json(&Trials::of(of_every_cause()));
     let group = &value["groups"][0];
-    assert_eq!((&group["trials"], &group["successes"]), (&10.into(), &2.into()));
-    assert_eq!(group["success"], 2.0 / 10.0);
-    assert_eq!(group["success_low"], tandem_core::Wilson::of(2, 10).low);
+    assert_eq!((&group["trials"], &group["successes"]), (&11.into(), &2.into()));
+    assert_eq!(group["success"], 2.0 / 11.0);
+    assert_eq!(group["success_low"], tandem_core::Wilson::of(2, 11).low);
     assert_eq!(group["failed_by"]["table-touched"], 1);
     assert_eq!(group["failed_by"]["other"], 0);
-    assert_eq!(group["median_duration_s"], 14.5);
-    assert_eq!(group["median_success_duration_s"], 18.5);
-    assert_eq!(group["failures"].as_array().unwrap().len(), 8);
+    assert_eq!(group["median_duration_s"], 15.0);
+    assert_eq!(group["median_success_duration_s"], 19.5);
+    assert_eq!(group["failures"].as_array().unwrap().len(), trials::CAUSES.len());
     assert_eq!(group["failures"][6]["log"], "trial-6.mcap");
     assert_eq!(group["paper"][0]["successes"], 40);
 }
