@@ -211,8 +211,8 @@ impl<D: Driver> Executor<D> {
         self.state = ArmsState::Playing { playback, holding: false };
     }
 
-    /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns whether
-    /// the arms have answered.
+    /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns
+    /// whether the arms have answered.
     pub fn stop(&mut self, now_s: f64) {
         self.halt(StopCause::Requested.anywhere(), now_s);
         // The next command repeats the order, under a number of its own.

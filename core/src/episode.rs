@@ -15,8 +15,8 @@ pub enum EpisodeKind {
     Evaluation,
 }
 
-/// The set of contacts during one control step. An environment may say which arms touched the table; it then does so for all
-/// of them.
+/// The set of contacts during one control step. An environment may say which arms touched the table; it then does so
+/// for all of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Contacts(u8);
 
@@ -64,15 +64,15 @@ impl Contacts {
         Self(self.0 & (Self::ARM_ARM.0 | Self::ARM_TABLE.0))
     }
 
-    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE), bits 2 and 3
-    /// tell which of two arms touched the table.
+    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE), bits 2
+    /// and 3 tell which of two arms touched the table.
     #[must_use]
     pub const fn bits(self) -> u8 {
         self.0
     }
 
-    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set, or an arm touched the table although none
-    /// did.
+    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set, or an arm touched the table
+    /// although none did.
     #[must_use]
     pub const fn from_bits(bits: u8) -> Option<Self> {
         let contradicts = bits & 0b1100 != 0 && bits & 0b10 == 0;
@@ -191,8 +191,8 @@ impl Episode {
         self.ends_with(|observation| self.layout.is_success(observation, &self.goal))
     }
 
-    /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and the
-    /// episode does not end so: an object was lost.
+    /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and
+    /// the episode does not end so: an object was lost.
     #[must_use]
     pub fn lost_goal(&self) -> bool {
         let mut n_succeeding = 0;

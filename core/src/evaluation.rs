@@ -8,8 +8,8 @@ pub const TEST_SEED: u64 = 777;
 /// The outcome of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeOutcome {
-    /// Every object was within the tolerance of its goal, and the task's other conditions held, after the last step or, if
-    /// the task asks for more of them, after the last steps.
+    /// Every object was within the tolerance of its goal, and the task's other conditions held, after the last step or,
+    /// if the task asks for more of them, after the last steps.
     pub success: bool,
     /// The norm over all arms' distances together was within the tolerance after the last step.
     pub success_joint: bool,

@@ -1,7 +1,7 @@
 //! The sparse reward: 0 if the goal is achieved, −1 otherwise.
 //!
-//! A [`TaskSpec`](crate::TaskSpec) has the reward of any task. The functions that take a [`Layout`] or no task at all are
-//! those of the built-in tasks, for programs that step the simulator themselves.
+//! A [`TaskSpec`](crate::TaskSpec) has the reward of any task. The functions that take a [`Layout`] or no task at all
+//! are those of the built-in tasks, for programs that step the simulator themselves.
 
 use crate::layout::{GOAL_TOLERANCE_M, Layout};
 
@@ -32,7 +32,8 @@ pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. At NaN the goal is not achieved.
+/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. At NaN the goal is not
+/// achieved.
 #[must_use]
 pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
     if distance <= tolerance { REWARD_ACHIEVED } else { REWARD_PENDING }

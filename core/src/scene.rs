@@ -49,8 +49,8 @@ pub struct Scene {
     pub time_s: f64,
     /// The arms, in order.
     pub arms: Vec<ArmScene>,
-    /// The objects, one per arm, in arm order. Of an object that the arms share, these are its parts: first the one that
-    /// each arm brings to its goal, then the others.
+    /// The objects, one per arm, in arm order. Of an object that the arms share, these are its parts: first the one
+    /// that each arm brings to its goal, then the others.
     pub objects: Vec<Cuboid>,
     /// Goal positions of the objects, in arm order.
     pub goals: Vec<Point>,

@@ -195,8 +195,8 @@ impl TaskSpec {
         &self.0.arms[arm.0].position
     }
 
-    /// Returns the indices, in an observation, of the coordinates of [`Self::position_of`] along the perpendicular axis,
-    /// which may be empty: see [`ArmDescription::lateral`].
+    /// Returns the indices, in an observation, of the coordinates of [`Self::position_of`] along the perpendicular
+    /// axis, which may be empty: see [`ArmDescription::lateral`].
     #[must_use]
     pub fn lateral_of(&self, arm: ArmIndex) -> &Part {
         &self.0.arms[arm.0].lateral
@@ -339,8 +339,8 @@ impl TaskSpec {
         self.distance(&achieved, &self.goal_of(arm).of(goal))
     }
 
-    /// Returns the distance of each arm from its goal in `observation`, then that from the part of the goal common to all
-    /// arms if there is one.
+    /// Returns the distance of each arm from its goal in `observation`, then that from the part of the goal common to
+    /// all arms if there is one.
     #[must_use]
     pub fn goal_distances(&self, observation: &[f32], goal: &[f32]) -> Vec<f32> {
         let of_arms = self.arms().map(|arm| self.goal_distance_of(arm, observation, goal));
@@ -373,8 +373,8 @@ impl TaskSpec {
         self.arm_reaches_goal(arm, observation, goal) && self.arm_meets_conditions(arm, observation)
     }
 
-    /// Returns true if `arm` satisfies all conditions of success other than the distance to the goal: it holds its object
-    /// and meets the further conditions, as far as the task has any.
+    /// Returns true if `arm` satisfies all conditions of success other than the distance to the goal: it holds its
+    /// object and meets the further conditions, as far as the task has any.
     ///
     /// # Panics
     /// If `observation` is too short.
@@ -414,7 +414,8 @@ impl TaskSpec {
             || self.distance(&achieved.of(observation), &desired.of(goal)) <= self.tolerance()
     }
 
-    /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects them.
+    /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects
+    /// them.
     #[must_use]
     pub fn observation_in_arm_order(&self, observation: &[f32]) -> Vec<f32> {
         self.in_arm_order(observation, Self::observation_of)

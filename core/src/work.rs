@@ -19,8 +19,8 @@ pub struct RunTerms {
     pub exploration: Exploration,
     /// Initial states and physics.
     pub world: WorldSettings,
-    /// Whether the action in evaluation episodes is the mean, before tanh, of the actor's action and of that for the scene
-    /// with the order of its arms reversed.
+    /// Whether the action in evaluation episodes is the mean, before tanh, of the actor's action and of that for the
+    /// scene with the order of its arms reversed.
     pub symmetrized_evaluation: bool,
 }
 

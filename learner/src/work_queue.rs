@@ -22,8 +22,8 @@ pub const SILENT_AFTER: Duration = Duration::from_secs(15);
 /// A slot that has been assigned for this time, and for twice the recent mean, is also assigned to a second worker that
 /// is idle.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
-/// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been slow
-/// and not dead.
+/// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been
+/// slow and not dead.
 pub const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most workers in a run.
 pub const MAX_WORKERS: usize = 10_000;
@@ -303,8 +303,8 @@ impl WorkQueue {
         (2 * self.mean_duration.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER)
     }
 
-    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may have
-    /// been removed meanwhile.
+    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may
+    /// have been removed meanwhile.
     ///
     /// # Errors
     /// When the worker has never joined or there never was such a slot.

@@ -1,9 +1,9 @@
 //! From models to a policy.
 //!
-//! A policy file has one form of network (`docs/policy-format.md`): inputs clipped after normalisation, ReLU between layers
-//! of equal width, tanh after the actor's last. Other networks are brought to this form where that changes no more than
-//! the rounding of their outputs: smaller layers are padded with units of weight 0, missing layers are identities, a
-//! constant factor moves into the next layer's weight.
+//! A policy file has one form of network (`docs/policy-format.md`): inputs clipped after normalisation, ReLU between
+//! layers of equal width, tanh after the actor's last. Other networks are brought to this form where that changes no
+//! more than the rounding of their outputs: smaller layers are padded with units of weight 0, missing layers are
+//! identities, a constant factor moves into the next layer's weight.
 
 mod columns;
 mod layers;

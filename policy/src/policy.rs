@@ -114,8 +114,8 @@ impl Policy {
     /// Validates sizes, lengths and numbers.
     ///
     /// # Errors
-    /// Returns an error if a size is out of range, the critic has neither one value nor one for each arm, a vector has the
-    /// wrong length, a number is not finite, or a standard deviation is not positive.
+    /// Returns an error if a size is out of range, the critic has neither one value nor one for each arm, a vector has
+    /// the wrong length, a number is not finite, or a standard deviation is not positive.
     pub fn check(&self) -> Result<(), Error> {
         check_network_size(self.n_hidden, self.n_hidden_layers)?;
         check_size("n_heads", self.n_heads, MAX_HEADS)?;
@@ -158,7 +158,8 @@ impl Policy {
     }
 }
 
-/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and of the normalisation alone.
+/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and of the normalisation
+/// alone.
 ///
 /// # Panics
 /// If the parameter vector is too short for the network; see [`Actor::new`].

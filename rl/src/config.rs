@@ -31,8 +31,8 @@ pub(crate) const EVALUATION_SLOT_EPISODES: usize = 8;
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`. A new run of `tandem
-    /// train` is named after its directory.
+    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`. A new run of
+    /// `tandem train` is named after its directory.
     pub name: String,
     /// A built-in task, by its full name: `push` and `pick-and-place` are those of the classic world. Or the name of
     /// `description`.
@@ -383,7 +383,8 @@ impl RunConfig {
         self.replay.contact_cost * (1.0 + self.share_of_part(round, 0.1, 0.5) * growth)
     }
 
-    /// Returns the discount in round `round`, from 0. Its horizon grows between one quarter and three quarters of the run.
+    /// Returns the discount in round `round`, from 0. Its horizon grows between one quarter and three quarters of the
+    /// run.
     #[must_use]
     pub fn discount(&self, round: u64) -> f32 {
         let share = self.share_of_part(round, 0.25, 0.75);

@@ -4,10 +4,10 @@
 //! actor's loss, a step of Adam for each, and Polyak averaging of the target networks. Both gradients are taken at the
 //! same parameters, so the critic's half and the actor's half of an update can run in parallel.
 //!
-//! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks of
-//! rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks are
-//! tasks that any number of threads take one after the other. Which tasks there are depends on sizes only, and no number
-//! is summed across tasks, so the bits do not depend on the number of threads.
+//! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks
+//! of rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks
+//! are tasks that any number of threads take one after the other. Which tasks there are depends on sizes only, and no
+//! number is summed across tasks, so the bits do not depend on the number of threads.
 
 use std::ops::Range;
 

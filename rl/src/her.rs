@@ -99,12 +99,12 @@ impl Sampler {
         self.contact_cost = cost;
     }
 
-    /// Sets the cost of an intervention, for strategy `rlif:T` (RL via intervention feedback, Luo et al. 2023): an arm's
-    /// own step before the teacher overrides it.
+    /// Sets the cost of an intervention, for strategy `rlif:T` (RL via intervention feedback, Luo et al. 2023): an
+    /// arm's own step before the teacher overrides it.
     ///
-    /// The steps that the teacher decides keep their reward: the stored action is the executed one, the teacher's, which
-    /// a cost would teach the student to avoid. An arm whose goal is replaced in hindsight keeps its recomputed reward,
-    /// because the teacher's verdict is about the desired goal.
+    /// The steps that the teacher decides keep their reward: the stored action is the executed one, the teacher's,
+    /// which a cost would teach the student to avoid. An arm whose goal is replaced in hindsight keeps its recomputed
+    /// reward, because the teacher's verdict is about the desired goal.
     pub const fn set_intervention_cost(&mut self, cost: f32) {
         self.intervention_cost = cost;
     }

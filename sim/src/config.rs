@@ -28,8 +28,8 @@ pub struct WorldConfig {
     pub pick_and_place: Friction,
     /// Friction in the task to carry a bar.
     pub carry_bar: Friction,
-    /// Coulomb friction coefficient of the pads in the shared world's push task, in [0, 2]. Their tips have the coefficient
-    /// that `push` gives to pads.
+    /// Coulomb friction coefficient of the pads in the shared world's push task, in [0, 2]. Their tips have the
+    /// coefficient that `push` gives to pads.
     pub rubber_pads: f32,
 }
 

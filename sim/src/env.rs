@@ -77,10 +77,10 @@ impl Env {
     /// Starts an episode with random positions of hands and objects and with random goals.
     ///
     /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold
-    /// it. If `randomization` of `settings` is not 0, the properties of the episode's world are drawn first: size and mass of
-    /// the objects, friction, a delay of up to 40 ms before an action takes effect, errors of observed positions and, in the
-    /// shared world, the margin of contacts. `substeps` has no effect: the resolution of the physics is that of the
-    /// [`WorldConfig`]. `settings` must be [checked](WorldSettings::check).
+    /// it. If `randomization` of `settings` is not 0, the properties of the episode's world are drawn first: size and
+    /// mass of the objects, friction, a delay of up to 40 ms before an action takes effect, errors of observed
+    /// positions and, in the shared world, the margin of contacts. `substeps` has no effect: the resolution of the
+    /// physics is that of the [`WorldConfig`]. `settings` must be [checked](WorldSettings::check).
     pub fn reset(&mut self, rng: &mut ChaCha8Rng, settings: WorldSettings) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
@@ -117,8 +117,8 @@ impl Env {
     /// | 22–24 | velocity of the end effector | m per control step |
     /// | 25–27 | rates of the openings | m per control step |
     ///
-    /// In episodes with `randomization`, numbers 3–8 have errors of a few millimetres, drawn per episode and per step. What
-    /// is computed from them, such as the achieved goal, has them too.
+    /// In episodes with `randomization`, numbers 3–8 have errors of a few millimetres, drawn per episode and per step.
+    /// What is computed from them, such as the achieved goal, has them too.
     ///
     /// # Panics
     /// If `observation` does not have length `n_observation`.
@@ -136,7 +136,8 @@ impl Env {
         &self.goal
     }
 
-    /// Returns the box that contains the goals of all episodes, in the frame of an arm: the range along each axis, metres.
+    /// Returns the box that contains the goals of all episodes, in the frame of an arm: the range along each axis,
+    /// metres.
     #[must_use]
     pub fn goal_area(&self) -> [[f32; 2]; 3] {
         goal_area(self.layout, self.object_half_m)
@@ -155,19 +156,21 @@ impl Env {
         self.goal[self.layout.goal_of(arm)].copy_from_slice(&in_area);
     }
 
-    /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the arms
-    /// during it.
+    /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the
+    /// arms during it.
     ///
     /// `action` has shape `[n_action]`, in arm frames, and is clamped to [−1, 1]. Each arm's part is a displacement of
-    /// the end effector along x, y and z in units of 5 cm and, in tasks of grasping, the gripper's input: positive values
-    /// open the gripper, −1 closes it and holds.
+    /// the end effector along x, y and z in units of 5 cm and, in tasks of grasping, the gripper's input: positive
+    /// values open the gripper, −1 closes it and holds.
     ///
     /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap
-    /// between a link and a part of the other arm falls below zero. In episodes of the shared world with `randomization`, a
-    /// gap below a margin of up to 2 cm, drawn with the episode, counts as a contact, between hands too. An arm is in contact with the table if palm, wrist
-    /// or fingers press on it; the links stay high above it. The workspace ends 2 mm above the table, 16 mm in the shared
-    /// world, so an arm touches the table only if it is pushed down. Only the shared world says which arm it was. In the shared world an arm is also in contact with the table while its hand presses
-    /// an object onto it with more than 10 N: arms whose torques are supervised stop there.
+    /// between a link and a part of the other arm falls below zero. In episodes of the shared world with
+    /// `randomization`, a gap below a margin of up to 2 cm, drawn with the episode, counts as a contact, between hands
+    /// too. An arm is in contact with the table if palm, wrist or fingers press on it; the links stay high above it.
+    /// The workspace ends 2 mm above the table, 16 mm in the shared world, so an arm touches the table only if it is
+    /// pushed down. Only the shared world says which arm it was. In the shared world an arm is also in contact with the
+    /// table while its hand presses an object onto it with more than 10 N: arms whose torques are supervised stop
+    /// there.
     ///
     /// # Errors
     /// Returns an error if `action` has the wrong length or contains a number that is not finite; the state is then

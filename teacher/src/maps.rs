@@ -1,7 +1,7 @@
 //! The maps between a student's vectors and those of a teacher for one arm (equations 7 to 9 of the paper), as data.
 //!
-//! A request contains the parts of a student's arms, concatenated in arm order. The student's own vectors may have another
-//! order.
+//! A request contains the parts of a student's arms, concatenated in arm order. The student's own vectors may have
+//! another order.
 
 use std::ops::Range;
 

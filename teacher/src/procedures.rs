@@ -2,8 +2,8 @@
 //! one arm.
 //!
 //! [`crate::advisor`] has the loop over the arms and `a = f^a(a_1, …, a_n)`; [`crate::budget`] has the test `n_b > 0`
-//! and the decrement. The procedures judge the action that the student is about to execute, exploration included, or its
-//! policy's action, as the run's `advice.judged_action` says.
+//! and the decrement. The procedures judge the action that the student is about to execute, exploration included, or
+//! its policy's action, as the run's `advice.judged_action` says.
 
 use tandem_core::ArmAdvice;
 use tandem_core::reward::distance;

@@ -5,9 +5,9 @@
 //! the training world becomes one motion, which is planned, checked and executed without observing the objects. Unlike
 //! the paper, it rehearses several episodes and executes the most robust one. [`TrialMode::ClosedLoop`] queries the
 //! policy before every step with the measurements of cameras and encoders; each step is planned and checked as a
-//! separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was computed by a closed loop on
-//! a copy of the pair. All modes use the same executor and envelope.
-//! [`outcome`] then evaluates the final positions of the objects.
+//! separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was computed by a closed loop
+//! on a copy of the pair. All modes use the same executor and envelope. [`outcome`] then evaluates the final positions
+//! of the objects.
 //!
 //! [`mapping`] relates the policy's world to the table.
 
@@ -89,12 +89,13 @@ pub struct TrialConfig {
     pub mode: TrialMode,
     /// The size and mass of the blocks. Their positions are drawn.
     pub block: Block,
-    /// Half the edge of the blocks that the policy was trained with, metres: [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M),
-    /// or that of `block` if their sizes varied. The policy perceives blocks and openings as those of such a block.
+    /// Half the edge of the blocks that the policy was trained with, metres:
+    /// [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M), or that of `block` if their sizes varied. The policy perceives
+    /// blocks and openings as those of such a block.
     pub trained_half_m: f64,
-    /// The largest number of rehearsals of an open loop in the training world, at least 1. If it is greater than 1 and none
-    /// is robust, as many may follow in the closed loop on copies of the pair. The most robust one is executed. Arms that
-    /// share an object rehearse once.
+    /// The largest number of rehearsals of an open loop in the training world, at least 1. If it is greater than 1 and
+    /// none is robust, as many may follow in the closed loop on copies of the pair. The most robust one is executed.
+    /// Arms that share an object rehearse once.
     pub n_rehearsals: u32,
     /// The seed of starts, goals, latencies and noise.
     pub seed: u64,

@@ -1,7 +1,8 @@
-//! Exploration in training episodes: Gaussian noise on every action, and random actions that are held for several steps.
+//! Exploration in training episodes: Gaussian noise on every action, and random actions that are held for several
+//! steps.
 //!
-//! A random action of one step hardly moves a hand. Held for several steps, it carries the hand, and objects with it, to
-//! new places.
+//! A random action of one step hardly moves a hand. Held for several steps, it carries the hand, and objects with it,
+//! to new places.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::{bernoulli, standard_normal, uniform};

@@ -161,7 +161,8 @@ pub fn log_name(episode: &Episode) -> String {
 /// the world that `metadata` describes, for the scenes of its log.
 ///
 /// # Errors
-/// When the episode, simulated again, differs from `episode`, or the log cannot be written. In that case no log remains.
+/// When the episode, simulated again, differs from `episode`, or the log cannot be written. In that case no log
+/// remains.
 pub fn record_episode(
     metadata: &EpisodeMetadata,
     episode: &Episode,
@@ -190,8 +191,8 @@ pub fn record_episode(
     Ok(recorder.finish()?)
 }
 
-/// Logs `episode` at `path` with the scenes and the advice of its `trace`, and returns the finished file's path. Nothing
-/// is simulated.
+/// Logs `episode` at `path` with the scenes and the advice of its `trace`, and returns the finished file's path.
+/// Nothing is simulated.
 ///
 /// # Errors
 /// When the log cannot be written. In that case no finished log remains.

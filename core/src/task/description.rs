@@ -51,8 +51,8 @@ pub struct TaskDescription {
     /// occupies the plane.
     #[serde(default)]
     pub base: f32,
-    /// Distances along that axis, across it and up: hands ([`ArmDescription::hand`]) that are nearer to each other along all
-    /// three are in contact. Three numbers, or none if that is unknown.
+    /// Distances along that axis, across it and up: hands ([`ArmDescription::hand`]) that are nearer to each other
+    /// along all three are in contact. Three numbers, or none if that is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub contact_distances: Vec<f32>,
     /// Largest magnitude of each number of an observation, shape `[n_observation]`.

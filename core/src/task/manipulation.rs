@@ -15,8 +15,8 @@ pub struct Manipulation {
     pub shared_object: bool,
     /// Name of the task that each arm taken by itself performs, which is that of a teacher; empty if it is this task's.
     pub one_arm_task: String,
-    /// Number of control steps at the end of an episode after all of which the goal must be achieved, 1 to the steps of an
-    /// episode.
+    /// Number of control steps at the end of an episode after all of which the goal must be achieved, 1 to the steps of
+    /// an episode.
     pub success_steps: usize,
     /// The arms in order, or none.
     pub arms: Vec<ArmManipulation>,

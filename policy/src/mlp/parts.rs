@@ -234,8 +234,8 @@ impl RowBlock<'_> {
 }
 
 impl Activations {
-    /// Computes the gradient of the loss with respect to the parameters of `block`, from its gradient with respect to the
-    /// output, shape `[batch, n_output]`, after a [`RowBlock::backward`] pass over every row of `input`, shape
+    /// Computes the gradient of the loss with respect to the parameters of `block`, from its gradient with respect to
+    /// the output, shape `[batch, n_output]`, after a [`RowBlock::backward`] pass over every row of `input`, shape
     /// `[batch, n_input]`.
     ///
     /// # Panics

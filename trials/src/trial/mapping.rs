@@ -11,8 +11,8 @@
 //! moves to the position of that hand after the step, and the policy observes its velocity. Objects have the hand's
 //! velocity to the extent that they moved with it.
 //!
-//! **Openings.** The policy knows the training world's gripper and blocks of one size. Three openings correspond: closed,
-//! open, and just touching the block. Openings in between are interpolated linearly.
+//! **Openings.** The policy knows the training world's gripper and blocks of one size. Three openings correspond:
+//! closed, open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout};
@@ -64,8 +64,9 @@ pub struct ArmObservation {
 }
 
 impl Mapping {
-    /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A shared
-    /// object counts as blocks of its width. The policy knows blocks with half an edge of `trained_half_m` metres.
+    /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A
+    /// shared object counts as blocks of its width. The policy knows blocks with half an edge of `trained_half_m`
+    /// metres.
     #[must_use]
     pub fn new(
         cell: WorkCell,
@@ -221,8 +222,8 @@ impl Mapping {
         self.hand.max_opening_m()
     }
 
-    /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above the
-    /// objects on the table; own frame, metres.
+    /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above
+    /// the objects on the table; own frame, metres.
     #[must_use]
     pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
         self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))

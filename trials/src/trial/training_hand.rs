@@ -59,8 +59,8 @@ impl TrainingHand {
         self.control_step_s
     }
 
-    /// Returns the position and velocity of the hand after a step with `action` (one arm's, in [−1, 1]) from `hand` with
-    /// `velocity`; own frame, metres and metres per second.
+    /// Returns the position and velocity of the hand after a step with `action` (one arm's, in [−1, 1]) from `hand`
+    /// with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
