@@ -78,8 +78,8 @@
 //!
 //! # Rewards
 //!
-//! The [`reward`] is sparse: in the built-in tasks, 0 if the objects are within 5 cm of their goals and −1 otherwise.
-//! One function serves success rates and hindsight relabelling alike.
+//! The [`reward`] of a step is sparse: in the built-in tasks, 0 if the distance from the goal is at most 5 cm and −1
+//! otherwise. One function serves success rates and hindsight relabelling alike.
 //!
 //! ```
 //! use tandem_core::reward::{REWARD_ACHIEVED, REWARD_PENDING, sparse_reward};

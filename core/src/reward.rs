@@ -20,7 +20,7 @@ pub fn distance(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
 }
 
-/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of the built-in tasks (section 4.1 of the paper).
+/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of the built-in tasks (sections 2.3 and 4.1 of the paper).
 ///
 /// `ε` is [`GOAL_TOLERANCE_M`]. Given the goals of all arms, shape `[n_goal]`, the result is the joint reward; given
 /// those of one arm, it is the arm's own reward.
@@ -55,7 +55,11 @@ pub fn is_success(layout: Layout, observation: &[f32], goal: &[f32]) -> bool {
     })
 }
 
-/// Returns the goal that `observation` achieves: the positions of all objects, in arm order, shape `[n_goal]`.
+/// Returns the goal that `observation` achieves: the positions of all objects, in arm order, arm frames, metres, shape
+/// `[n_goal]`. This is `f_g` of the paper (section 2.3).
+///
+/// # Panics
+/// The iterator panics if `observation` is too short for `layout`.
 pub fn achieved_goal(layout: Layout, observation: &[f32]) -> impl Iterator<Item = f32> {
     layout.arms().flat_map(move |arm| observation[layout.achieved_goal_of(arm)].iter().copied())
 }

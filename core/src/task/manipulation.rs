@@ -28,9 +28,9 @@ pub struct Manipulation {
 pub struct ArmManipulation {
     /// Index of the action that opens the gripper if it is positive. Exploration opens no gripper that holds an object.
     pub gripper: Option<usize>,
-    /// The conditions under which the arm holds its object. If there are any, success needs them.
+    /// The conditions under which the arm holds its object, at most 16. If there are any, success needs them.
     pub holding: Vec<Condition>,
-    /// Further conditions of success.
+    /// Further conditions of success, at most 16.
     pub conditions: Vec<Condition>,
 }
 
@@ -43,7 +43,7 @@ pub struct Condition {
     /// The values from which the distance is measured, one for each index; empty means zeros.
     #[serde(default)]
     pub target: Vec<f32>,
-    /// The largest distance, in the task's norm.
+    /// The largest distance, in the task's norm, 0 or more.
     pub tolerance: f32,
 }
 
