@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use tandem_core::{Task, World, WorldSettings};
 
-/// Physics parameters of a world.
+/// Physics parameters of a world. The default is the world in which policies are evaluated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {

@@ -67,7 +67,7 @@ impl Reach {
         Vector::new(self.axis_x_m, 0.0, height_m)
     }
 
-    /// Moves a point (arm frame, metres) along its radius to the nearest one in reach.
+    /// Moves a point (arm frame, metres) along its radius, at its height, to the nearest one in reach.
     #[must_use]
     pub fn clamp(&self, point: Vector) -> Vector {
         let radius_m = self.radius_m(point.to_array());
