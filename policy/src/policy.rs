@@ -26,7 +26,7 @@ pub struct Policy {
     pub n_hidden: usize,
     /// Number of hidden layers of both networks.
     pub n_hidden_layers: usize,
-    /// Number of values that the critic returns: 1, or one per arm.
+    /// Number of values that the critic returns: 1, of the joint reward, or one per arm.
     pub n_heads: usize,
     /// Parameters of the actor, shape `[n_parameters]` of [`Policy::actor_shape`].
     pub actor: Vec<f32>,
@@ -73,7 +73,7 @@ impl Policy {
     /// Creates the actor, which chooses actions.
     ///
     /// # Errors
-    /// Returns an error if a vector has the wrong length or contains an invalid number.
+    /// Returns an error if a size is out of range, or a vector has the wrong length or contains an invalid number.
     pub fn actor(&self) -> Result<Actor, Error> {
         Actor::new(&self.layout, self.published(0))
     }
@@ -81,7 +81,7 @@ impl Policy {
     /// Creates the critic, which values actions.
     ///
     /// # Errors
-    /// Returns an error if a vector has the wrong length or contains an invalid number.
+    /// Returns an error if a size is out of range, or a vector has the wrong length or contains an invalid number.
     pub fn critic(&self) -> Result<Critic, Error> {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());

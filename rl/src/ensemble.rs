@@ -22,7 +22,7 @@ const N_HIDDEN_LAYERS: usize = 2;
 /// The first number of a critic in the stream of initialisations; actor and critic of the student have 0 and 1.
 const FIRST_NUMBER: u64 = 2;
 
-/// The critics and their optimisers.
+/// Three critics of two hidden layers with 64 units each, and their optimisers.
 #[derive(Debug, Clone)]
 pub struct CriticEnsemble {
     shape: MlpShape,
@@ -120,7 +120,7 @@ impl CriticEnsemble {
     /// Restores the vectors returned by [`state`](Self::state), in its order, after `n_updates` updates.
     ///
     /// # Errors
-    /// Names the first vector that has another length. The ensemble is unusable then.
+    /// Describes the mismatch: another number of vectors, or the first one of another length. Nothing changes then.
     pub fn restore(&mut self, stored: &[Vec<f32>], n_updates: u64) -> Result<(), String> {
         let expected = self.shape.n_parameters();
         if stored.len() != 3 * self.members.len() {

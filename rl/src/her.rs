@@ -94,7 +94,7 @@ impl Sampler {
         }
     }
 
-    /// Sets the cost of a contact for the batches that follow.
+    /// Sets the cost of a contact, in units of reward, 0 or more, for the batches that follow.
     pub const fn set_contact_cost(&mut self, cost: f32) {
         self.contact_cost = cost;
     }
@@ -109,7 +109,8 @@ impl Sampler {
         self.intervention_cost = cost;
     }
 
-    /// Fills every row of `batch` with a transition sampled from `buffer`.
+    /// Fills every row of `batch` with a transition sampled from `buffer`. Observations and goals are normalised with
+    /// `statistics`.
     ///
     /// # Panics
     /// When the buffer is empty or the batch has another layout.

@@ -31,14 +31,14 @@ pub struct JumpStart {
 }
 
 impl JumpStart {
-    /// Creates the state before the first round, with horizon `max_horizon`.
+    /// Creates the state before the first round, with horizon `max_horizon`, control steps.
     #[must_use]
     pub const fn new(max_horizon: u32) -> Self {
         Self { max_horizon, present: max_horizon, next: max_horizon, n_episodes: 0, n_succeeded: 0 }
     }
 
-    /// Returns the horizon of a round: the one to be learned next (0), or the one after it (1). Later rounds are not
-    /// decided yet, and have that of round 1.
+    /// Returns the horizon of a round, control steps: the one to be learned next (0), or the one after it (1). Later
+    /// rounds are not decided yet, and have that of round 1.
     #[must_use]
     pub const fn horizon(&self, n_rounds_ahead: u64) -> u32 {
         if n_rounds_ahead == 0 { self.present } else { self.next }
@@ -56,7 +56,8 @@ impl JumpStart {
         }
     }
 
-    /// Returns the state without `H`, as a checkpoint stores it.
+    /// Returns the state without `H`, as a checkpoint stores it: the horizons of the present and the next round, and
+    /// the episodes of the window and those of them that succeeded.
     #[must_use]
     pub const fn state(&self) -> [u32; 4] {
         [self.present, self.next, self.n_episodes, self.n_succeeded]

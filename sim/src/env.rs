@@ -18,8 +18,8 @@ use crate::world::World;
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
 
-/// One of the environments: push or pick and place, with one arm or two, in the classic or the shared world, or two arms
-/// that carry a bar in the slow world.
+/// One of the environments: push or pick and place, with one arm or two, in the classic or the shared world, or two
+/// arms that carry a bar in the slow world.
 ///
 /// An episode is a function of the random numbers passed to [`reset`](Self::reset) and of the actions, bit for bit. It
 /// depends neither on earlier episodes nor on the thread.
@@ -118,8 +118,8 @@ impl Env {
     /// | 22–24 | velocity of the end effector | m per control step |
     /// | 25–27 | rates of the openings | m per control step |
     ///
-    /// A gripper of the shared world has two fingers: numbers 9 and 10, and 25 and 26, are those of the same one. Openings
-    /// are 0 in tasks without grasping, whose gripper is locked.
+    /// A gripper of the shared world has two fingers: numbers 9 and 10, and 25 and 26, are those of the same one.
+    /// Openings are 0 in tasks without grasping, whose gripper is locked.
     ///
     /// In episodes with `randomization`, numbers 3–8 have errors of a few millimetres, drawn per episode and per step.
     /// What is computed from them, such as the achieved goal, has them too.
@@ -134,8 +134,8 @@ impl Env {
         }
     }
 
-    /// Returns the goal positions of the objects, in arm order, each in the arm's frame, metres, shape `[n_goal]`; zeros
-    /// before the first reset.
+    /// Returns the goal positions of the objects, in arm order, each in the arm's frame, metres, shape `[n_goal]`;
+    /// zeros before the first reset.
     #[must_use]
     pub fn goal(&self) -> &[f32] {
         &self.goal

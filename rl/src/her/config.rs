@@ -65,8 +65,8 @@ pub struct ReplayConfig {
     #[serde(default)]
     pub joint_goal_statistics: bool,
     /// Distance between an object and its goal, in the unit of the goal, within which training rewards it: in the
-    /// built-in tasks 0.0001 to 1 m, else above 0 (paper: 0.05 m). The task's own tolerance always defines success. A
-    /// smaller distance leaves room for the motion of an object after its release.
+    /// built-in tasks 0.0001 to 1 m, else above 0 (paper: not given; Fetch environments: 0.05 m). The task's own
+    /// tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
     pub goal_tolerance_m: f32,
     /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper:
     /// 0). A contact with the table costs every arm unless the environment says which arm it was, as the shared world
@@ -87,7 +87,7 @@ const fn constant() -> f32 {
 }
 
 impl ReplayConfig {
-    /// Returns the lowest reward of a step.
+    /// Returns the lowest reward of a step: that of a pending goal and the largest cost of a contact.
     #[must_use]
     pub const fn lowest_reward(&self) -> f32 {
         -1.0 - self.contact_cost * self.contact_cost_growth
