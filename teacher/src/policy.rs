@@ -16,7 +16,8 @@ pub use onnx::OnnxPolicy;
 /// Extension of the files that hold an ONNX model.
 const ONNX_EXTENSION: &str = "onnx";
 
-/// A policy for one arm with an actor and a critic. Rows are states of one arm.
+/// A policy for one arm with an actor and, unless it has no values, a critic. Rows are states of one arm. Callers pass
+/// vectors whose lengths fit the [task](Self::layout).
 pub trait TeacherPolicy: Send {
     /// Returns the task, of one arm.
     fn layout(&self) -> TaskSpec;
@@ -30,7 +31,7 @@ pub trait TeacherPolicy: Send {
         true
     }
 
-    /// Writes the actions of `π_tr`, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
+    /// Writes the actions of `π_tr`, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
     /// `goals`, shape `[n, n_goal]`.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
 
