@@ -130,7 +130,7 @@ pub struct TrialReport {
     pub n_shortened: usize,
     /// All contacts of the arms.
     pub touched: Contacts,
-    /// The smallest gap between the arms, metres.
+    /// The smallest gap between the arms, metres: negative if their capsules overlapped, infinite with one arm.
     pub arms_gap_m: f64,
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,

@@ -53,9 +53,9 @@ pub struct Mapping {
 pub struct ArmObservation {
     /// The end effector, own frame, metres.
     pub hand: DVec3,
-    /// The velocity of the training world's end effector, metres per second.
+    /// The velocity of the training world's end effector, own frame, metres per second.
     pub hand_velocity: DVec3,
-    /// The opening of each side of the gripper, metres.
+    /// The opening of each side of the policy's gripper, metres; 0 in tasks without grasping.
     pub opening_m: f64,
     /// The object, own frame, metres.
     pub object: DVec3,
@@ -189,7 +189,12 @@ impl Mapping {
         }
     }
 
-    /// Converts measurements of `arm` and its object to the policy's terms.
+    /// Converts measurements of `arm` and its object to the policy's terms: joint angles `angles` (radians), the real
+    /// gripper's `opening` (0 to 1), the velocity of the training world's hand (own frame, metres per second) and the
+    /// object as seen (world frame).
+    ///
+    /// # Panics
+    /// Panics if there is no such arm.
     #[must_use]
     pub fn observe(
         &self,
