@@ -89,8 +89,9 @@ pub enum JoinError {
 impl WorkQueue {
     /// Adds a worker that calls over `connection` and returns its number.
     ///
-    /// A full queue removes a worker that has joined and done nothing else: first one of the same connection if that
-    /// has too many, then one that does not ask for work, then one of the connection that has most of them.
+    /// A connection with too many workers that have delivered nothing loses the oldest of them that plays nothing. A
+    /// full queue removes the oldest worker that has not asked for work within [`ASK_WITHIN`], otherwise the one that
+    /// has been silent longest, otherwise one of the connection that has most workers without a delivery.
     ///
     /// # Errors
     /// When there are too many workers and none of them can be removed.

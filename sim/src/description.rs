@@ -86,7 +86,7 @@ pub struct ShapeDescription {
     pub part: Part,
     /// Index of the arm that it belongs to.
     pub arm: usize,
-    /// Mass, kilograms.
+    /// Mass, kilograms; 0 for a fixed shape.
     pub mass_kg: f32,
     /// Shape and size.
     #[serde(flatten)]
