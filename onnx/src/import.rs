@@ -77,7 +77,7 @@ pub fn import(
 /// [`import`] concerns both models.
 ///
 /// # Errors
-/// When it does not, or cannot.
+/// When the network does not fit, or a policy file cannot represent it.
 pub fn check(model: &Model, role: Role, layout: &TaskSpec) -> Result<(), ModelError> {
     let network = Converted::new(&BoundNetwork::new(model, role, layout)?, role)?;
     match role {
