@@ -19,8 +19,8 @@ pub use worker::{SilentWorker, Worker};
 
 /// A worker that has not called for this time counts as dead: its slots return to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
-/// A slot that has been assigned for this time, and for twice the recent mean, is also assigned to a second worker that
-/// is idle.
+/// A slot that has been assigned for this time, and for twice the recent mean but at most [`SILENT_AFTER`], is also
+/// assigned to a second worker that is idle.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
 /// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been
 /// slow and not dead.

@@ -22,7 +22,7 @@ pub trait TeacherPolicy: Send {
     /// Returns the task, of one arm.
     fn layout(&self) -> TaskSpec;
 
-    /// Returns the text that identifies the policy: the SHA-256 of the parameters, hexadecimal.
+    /// Returns the text that identifies the policy: the SHA-256, hexadecimal, of its parameters or files.
     fn digest(&self) -> &str;
 
     /// Returns true if the policy values actions. If not, the teacher refuses strategies that compare values, and does
@@ -162,7 +162,7 @@ impl OneArmPolicy {
     /// Prepares `policy` for inference.
     ///
     /// # Errors
-    /// When the policy is not for one arm, or its critic has several values.
+    /// When the policy is not for one arm or is invalid, or its critic has several values.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
         Self::of(policy, "this one".to_owned())
     }
