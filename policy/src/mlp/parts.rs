@@ -305,12 +305,12 @@ impl TransposedWeights {
         blocks
     }
 
-    /// Returns the weights of all layers in a row, for elementwise work.
+    /// Returns the weights of all layers, one layer after the other, for elementwise work.
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
         &mut self.0
     }
 
-    /// Returns the weights of all layers in a row.
+    /// Returns the weights of all layers, one layer after the other.
     #[must_use]
     pub fn as_slice(&self) -> &[f32] {
         &self.0
