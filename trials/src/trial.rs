@@ -87,7 +87,7 @@ pub struct TrialConfig {
     pub layout: Layout,
     /// The way in which the policy is used.
     pub mode: TrialMode,
-    /// The size and mass of the blocks. Their positions are drawn.
+    /// The size and mass of the blocks. Their positions and rotations are drawn.
     pub block: Block,
     /// Half the edge of the blocks that the policy was trained with, metres:
     /// [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M), or that of `block` if their sizes varied. The policy perceives

@@ -34,6 +34,9 @@ const WITHDRAWN_M: [f64; 2] = [-0.05, 0.20];
 const TILT_ROUNDS: usize = 4;
 
 /// The mapping of a policy's world into a work cell.
+///
+/// # Panics
+/// Methods panic if there is no such arm, or an action is shorter than the task's for one arm.
 #[derive(Debug, Clone)]
 pub struct Mapping {
     cell: WorkCell,
@@ -192,9 +195,6 @@ impl Mapping {
     /// Converts measurements of `arm` and its object to the policy's terms: joint angles `angles` (radians), the real
     /// gripper's `opening` (0 to 1), the velocity of the training world's hand (own frame, metres per second) and the
     /// object as seen (world frame).
-    ///
-    /// # Panics
-    /// Panics if there is no such arm.
     #[must_use]
     pub fn observe(
         &self,
@@ -234,16 +234,17 @@ impl Mapping {
         self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))
     }
 
-    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1,
-    /// 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, shape
+    /// `[action_per_arm]`, in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         self.hand.after(hand, velocity, action)
     }
 
-    /// Returns the opening of each side of the gripper to command after a step with `action`, metres. `commanded_m` was
-    /// commanded before and `actual_m` reached. A gripper that closes is commanded beyond an object between its pads,
-    /// which presses on it; one that opens starts from the object's size, as in the training world.
+    /// Returns the opening of each side of the policy's gripper to command after a step with `action` (one arm's, of a
+    /// task of grasping), metres. `commanded_m` was commanded before and `actual_m` reached, metres. A gripper that
+    /// closes is commanded beyond an object between its pads, which presses on it; one that opens starts from the
+    /// object's size, as in the training world.
     #[must_use]
     pub fn opening_after(&self, commanded_m: f64, actual_m: f64, action: &[f32]) -> f64 {
         if !self.layout.task.grasps() {
