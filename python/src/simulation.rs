@@ -75,8 +75,8 @@ impl Simulation {
         Ok((self.observation(py)?, self.info(py)?))
     }
 
-    /// Executes `action`, shape `[n_action]`, clamped to [−1, 1], and returns observation, reward, terminated, truncated
-    /// and info. An episode never ends by itself: the two flags are false.
+    /// Executes `action`, shape `[n_action]`, clamped to [−1, 1]. Returns observation, reward, terminated, truncated and
+    /// info; an episode never ends by itself, so the two flags are false.
     fn step<'py>(&mut self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Step<'py>> {
         self.step_by(py, action, Episode::step)
     }

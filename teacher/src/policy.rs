@@ -31,8 +31,8 @@ pub trait TeacherPolicy: Send {
         true
     }
 
-    /// Writes the actions of `π_tr`, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
-    /// `goals`, shape `[n, n_goal]`.
+    /// Writes the actions of `π_tr`, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`,
+    /// and `goals`, shape `[n, n_goal]`.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
 
     /// Writes the values of `Q_tr`, shape `[n]`, of `actions`, shape `[n, n_action]`, in the same states.
