@@ -58,8 +58,8 @@ pub fn sim(clock: &Clock) -> Result<Vec<Figure>, Error> {
     Ok(figures)
 }
 
-/// Measures the time of one decision of the two-arm student, for one, two and eight episodes in lock step, and the ratio
-/// of an episode's time among eight to its time alone.
+/// Measures the time of one decision of the two-arm student, for one, two and eight episodes in lock step, and the
+/// ratio of an episode's time among eight to its time alone.
 ///
 /// # Errors
 /// When the default settings give no policy, which is a bug.
@@ -85,8 +85,8 @@ pub fn inference(clock: &Clock) -> Result<Vec<Figure>, Error> {
     ])
 }
 
-/// Measures updates of the two-arm student per second with one, two, four and so on up to as many threads as the machine
-/// has cores, and their ratio to one thread and of that to the matrix product.
+/// Measures updates of the two-arm student per second with one, two, four and so on up to as many threads as the
+/// machine has cores, and their ratio to one thread and of that to the matrix product.
 pub fn update(clock: &Clock) -> Vec<Figure> {
     let layout = Layout::new(Task::Push, 2);
     let config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2).ddpg;

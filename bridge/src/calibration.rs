@@ -10,7 +10,8 @@
 //! *reaction* is the time from the stamp of the newest state at the time of a stop until the joint begins to brake: the
 //! longest one of an arm, plus a period, because commands are not sent at the very moment when a state arrives. The
 //! *braking time* is scaled to the joint's highest speed, for drives that brake with a constant deceleration; drives
-//! that need the same time at any speed appear slower than they are. The slowest joint determines the time of an arm.
+//! that need the same time at any speed appear slower than they are. The slowest joint determines the reaction and the
+//! braking time of an arm; its lag is the mean over its joints.
 
 use std::cell::RefCell;
 use std::rc::Rc;

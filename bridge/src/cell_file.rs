@@ -30,12 +30,12 @@ const MODELS: [&ArmModel; 1] = [&MICO_4];
 pub struct CellFile {
     /// Whether the arms report torques without those that carry their own weight; `None` for the driver's default.
     pub reports_torques: Option<bool>,
-    /// Behind kinova-ros, the time constant of the mean that is subtracted from efforts, seconds; `None` for the
-    /// default. Only without `reports_torques`.
+    /// Behind kinova-ros, the time constant of the mean that is subtracted from efforts, 0.1 to 2 seconds; `None` for
+    /// the default, 0.4. Only without `reports_torques`.
     pub torque_mean_s: Option<f64>,
     /// The table.
     pub table: Table,
-    /// The arms, in the order of commands.
+    /// The two arms, in the order of commands, with bases 0.15 to 4 metres apart.
     pub arms: Vec<Arm>,
     /// The limits of motions.
     #[serde(default)]
@@ -49,7 +49,7 @@ pub struct CellFile {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
-    /// Height of its top in the world, metres.
+    /// Height of its top in the world, −1 to 1 metre.
     pub height_m: f64,
 }
 
@@ -57,21 +57,24 @@ pub struct Table {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Arm {
-    /// Name for operators: lower-case letters, digits, `-` and `_`.
+    /// Name for operators: 1 to 32 lower-case letters, digits, `-` and `_`.
     pub name: String,
-    /// Kinova's name of the model, such as `m1n4s200`.
+    /// Kinova's name of the model: `m1n4s200`.
     pub model: String,
-    /// Origin of the base frame in the world: x, y, z, metres.
+    /// Origin of the base frame in the world: x, y, z, each −3 to 3 metres, and at most 0.3 metres above or below the
+    /// table.
     #[serde(deserialize_with = "exactly")]
     pub base_m: [f64; 3],
-    /// Rotation of the base frame about the world's z axis, degrees.
+    /// Rotation of the base frame about the world's z axis, −360 to 360 degrees. Its x axis points at the workspace.
     pub yaw_degrees: f64,
-    /// Usual time from a command until measured angles reflect it, seconds; `None` if it was not measured.
+    /// Usual time from a command until measured angles reflect it, 0 to 0.12 seconds and at most `reaction_s`; `None`
+    /// if it was not measured. The three times are given together or not at all.
     pub lag_s: Option<f64>,
-    /// Longest time from the measurement of a state until a command based on it takes effect, seconds; `None` if it was
-    /// not measured.
+    /// Longest time from the measurement of a state until a command based on it takes effect, 0.01 to 0.2 seconds;
+    /// `None` if it was not measured.
     pub reaction_s: Option<f64>,
-    /// Time in which the drives brake a joint from its highest speed to rest, seconds; `None` if it was not measured.
+    /// Time in which the drives brake a joint from its highest speed to rest, 0.001 to 0.25 seconds and at most
+    /// `ramp_s` of the limits; `None` if it was not measured.
     pub brake_s: Option<f64>,
     /// ROS node of the arm's driver; `None` for `/NAME/MODEL_driver`.
     pub ros_node: Option<String>,
@@ -79,35 +82,35 @@ pub struct Arm {
     pub ros_joint_prefix: Option<String>,
 }
 
-/// The limits of motions.
+/// The limits of motions. Gaps are at least those of the default.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Largest speed of a tool, metres per second.
+    /// Largest speed of a tool, 0.01 to 0.5 metres per second.
     pub tool_speed_mps: f64,
-    /// Time in which a joint may accelerate from rest to its largest speed, seconds.
+    /// Time in which a joint may accelerate from rest to its largest speed, 0.1 to 2 seconds.
     pub ramp_s: f64,
-    /// Largest change of a gripper's opening, 1/s.
+    /// Largest change of a gripper's opening, 0.05 to 2 per second; 1 is from closed to open.
     pub opening_per_s: f64,
-    /// Largest angle between a gripper and the vertical, degrees.
+    /// Largest angle between a gripper's direction and straight down, 5 to 90 degrees.
     pub tilt_degrees: f64,
-    /// Largest extension of an arm, as a share of its reach.
+    /// Largest extension of an arm, as a share of its reach, 0.3 to 0.99.
     pub reach_share: f64,
-    /// Smallest gap to the table in a motion, metres.
+    /// Smallest gap to the table in a motion, metres, at most 0.2 and at least 1 mm more than `table_gap_m`.
     pub check_table_gap_m: f64,
-    /// Smallest gap between the arms in a motion, metres.
+    /// Smallest gap between the arms in a motion, metres, at most 0.4 and at least 1 mm more than `arms_gap_m`.
     pub check_arms_gap_m: f64,
-    /// Smallest gap between parts of one arm in a motion, metres.
+    /// Smallest gap between parts of one arm in a motion, metres, at most 0.1 and at least 1 mm more than `self_gap_m`.
     pub check_self_gap_m: f64,
-    /// Gap to the table below which the envelope stops the arms, metres.
+    /// Gap to the table below which the envelope stops the arms, metres, at most 0.1.
     pub table_gap_m: f64,
-    /// Gap between the arms below which the envelope stops them, metres.
+    /// Gap between the arms below which the envelope stops them, metres, at most 0.2.
     pub arms_gap_m: f64,
-    /// Gap between parts of one arm below which the envelope stops it, metres.
+    /// Gap between parts of one arm below which the envelope stops it, metres, at most 0.05.
     pub self_gap_m: f64,
-    /// Largest tracking error of a joint, degrees.
+    /// Largest tracking error of a joint, 0.2 to 5 degrees.
     pub tracking_degrees: f64,
-    /// Largest external torque, newton metres.
+    /// Largest external torque on a joint, 0.5 to 20 newton metres.
     pub torque_nm: f64,
 }
 
@@ -115,12 +118,12 @@ pub struct Limits {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Simulated {
-    /// Smallest and largest number of periods of 10 ms until a command takes effect.
+    /// Smallest and largest number of periods of 10 ms until a command takes effect, each 1 to 10.
     #[serde(deserialize_with = "exactly")]
     pub latency_periods: [u32; 2],
-    /// Time constant with which a joint's speed follows its command, seconds.
+    /// Time constant with which a joint's speed follows its command, 0.001 to 0.1 seconds.
     pub lag_s: f64,
-    /// Time in which a drive brakes a joint from its highest speed to rest, seconds.
+    /// Time in which a drive brakes a joint from its highest speed to rest, 0.005 to 0.25 seconds.
     pub brake_s: f64,
 }
 
@@ -207,6 +210,7 @@ impl CellFile {
     }
 
     /// Returns the settings of the executor: `defaults`, the limits of the file, and the times of the slower arm.
+    /// Pauses take at least twice its braking time.
     #[must_use]
     pub fn settings(&self, defaults: &Settings) -> Settings {
         let limits = &self.limits;

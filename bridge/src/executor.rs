@@ -53,7 +53,8 @@ mod stop;
 /// Time without a new state after which the arms count as disconnected, although commands can be sent, seconds.
 const LOST_S: f64 = 1.0;
 
-/// Moves a pair of arms. The executor is the only user of their driver.
+/// Moves a pair of arms. The executor is the only user of their driver. Times `now_s` are seconds since any start and
+/// never decrease.
 #[derive(Debug)]
 pub struct Executor<D: Driver> {
     cell: WorkCell,
@@ -211,8 +212,8 @@ impl<D: Driver> Executor<D> {
         self.state = ArmsState::Playing { playback, holding: false };
     }
 
-    /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns whether
-    /// the arms have answered.
+    /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns
+    /// whether the arms have answered.
     pub fn stop(&mut self, now_s: f64) {
         self.halt(StopCause::Requested.anywhere(), now_s);
         // The next command repeats the order, under a number of its own.
@@ -294,7 +295,8 @@ impl<D: Driver> Executor<D> {
         Ok(())
     }
 
-    /// Starts a period at `now_s`: sends a command and receives a state. Must be called once per period.
+    /// Starts a period at `now_s`, seconds: sends a command, receives a state and returns the phase after that. Must be
+    /// called once per period.
     pub fn tick(&mut self, now_s: f64) -> Phase {
         let order = self.next_order(now_s).unwrap_or_else(|breach| {
             self.halt(breach, now_s);

@@ -98,7 +98,8 @@ impl QuarcDriver {
     /// Connects to a stream server and waits for its first state. Sends nothing.
     ///
     /// # Errors
-    /// Returns an error if the address does not respond or does not send states.
+    /// Returns an error if the wait of `config` is not shorter than the period, or the address does not respond or
+    /// sends no states.
     pub fn connect(config: QuarcConfig) -> Result<Self, DriverError> {
         let config = config.checked()?;
         let bare = config.address.trim_start_matches("tcpip://").trim_end_matches('/');
@@ -123,7 +124,7 @@ impl QuarcDriver {
     /// appears in messages.
     ///
     /// # Errors
-    /// Returns an error if the connection does not send states.
+    /// Returns an error if the wait of `config` is not shorter than the period, or the connection sends no states.
     pub fn over(stream: TcpStream, config: QuarcConfig) -> Result<Self, DriverError> {
         let config = config.checked()?;
         let failed = |error: std::io::Error| lost(&format!("{:?}", config.address), &error);

@@ -1,7 +1,8 @@
 //! The service `tandem.v1.Bridge`: a thin shell around an [`Executor`] on its own thread.
 //!
-//! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled between
-//! ticks; progress is published in snapshots, whose lock readers hold only to clone a pointer. A stop waits in no queue.
+//! No client can delay a tick: motions are planned and checked on other threads, one at a time; calls are handled
+//! between ticks; progress is published in snapshots, whose lock readers hold only to clone a pointer. A stop waits in
+//! no queue.
 //!
 //! **The drives always stop**: when the service shuts down, a stream ends or breaks, the owner falls silent, a driver
 //! fails, or the arms' thread panics. The drives of a killed process brake because they receive no commands.

@@ -1,8 +1,8 @@
 //! The placement of the arms and the limits of their motions.
 //!
 //! Lengths are not scaled: a metre of the training world is a metre here. The bases are 0.27 m behind the centres of
-//! their workspaces (0.22 m in the shared world), where the gripper of the Mico with four joints tilts least. Measured for
-//! 0.27 m on points drawn uniformly from the tasks' area (example `area` of `tandem-kinematics`):
+//! their workspaces (0.22 m in the shared world), where the gripper of the Mico with four joints tilts least. Measured
+//! for 0.27 m on points drawn uniformly from the tasks' area (example `area` of `tandem-kinematics`):
 //!
 //! | share of points with a tilt of at most | 15° | 25° | 40° |
 //! |---|---|---|---|

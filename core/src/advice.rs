@@ -1,17 +1,20 @@
 //! Queries to a teacher and its advice.
 
 /// One step on which a student asks for advice.
+///
+/// Its vectors are the parts of the arms, concatenated in arm order: see
+/// [`TaskSpec::observation_in_arm_order`](crate::TaskSpec::observation_in_arm_order).
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepQuery {
     /// The episode's number.
     pub episode: u64,
     /// The step, from 0.
     pub step: u32,
-    /// Shape `[n_observation]`.
+    /// The observation before the step, shape `[n_observation]`.
     pub observation: Vec<f32>,
-    /// Shape `[n_goal]`.
+    /// The desired goal, shape `[n_goal]`.
     pub goal: Vec<f32>,
-    /// The action that the student is about to execute, exploration included, shape `[n_action]`.
+    /// The action that the student is about to execute, exploration included, in [−1, 1], shape `[n_action]`.
     pub proposed_action: Vec<f32>,
     /// The action that the teacher judges, shape `[n_action]`; `None` means the proposed action. Arms that are not
     /// overridden execute the proposed action in either case.
@@ -32,15 +35,15 @@ impl StepQuery {
 /// The teacher's answer for one arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArmAdvice {
-    /// The teacher's action, shape `[action_per_arm]`.
+    /// The teacher's action, in [−1, 1], shape `[action_per_arm]`.
     pub teacher_action: Vec<f32>,
-    /// The teacher's value of its own action.
+    /// The teacher's value of its own action; 0 if its policy has no critic.
     pub q_teacher: f32,
-    /// The teacher's value of the judged action.
+    /// The teacher's value of the judged action; 0 if its policy has no critic.
     pub q_student: f32,
     /// `q_teacher − q_student` (equation 10).
     pub importance: f32,
-    /// The Euclidean distance of the two actions.
+    /// The Euclidean distance between the teacher's action and the judged one: `D` of procedure 3.
     pub distance: f32,
     /// Whether the teacher's action replaces the student's.
     pub overridden: bool,
@@ -49,7 +52,7 @@ pub struct ArmAdvice {
 /// The teacher's answer for one step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepAdvice {
-    /// The action to execute, shape `[n_action]`.
+    /// The action to execute, in arm order, shape `[n_action]`.
     pub action: Vec<f32>,
     /// Whether the step cost a unit of the budget, which other steps of the request may share.
     pub charged: bool,

@@ -55,7 +55,8 @@ const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
 const PER_STEP: std::ops::Range<usize> = 16..OBSERVATION_PER_ARM;
 
 impl Layout {
-    /// Returns the largest magnitude that number `idx` of an observation can have.
+    /// Returns the largest magnitude that number `idx` of an observation can have, in the number's own unit (see
+    /// `tandem_sim::Env::observe`).
     #[must_use]
     pub const fn observation_bound(self, idx: usize) -> f32 {
         let part_idx = idx % OBSERVATION_PER_ARM;

@@ -15,8 +15,8 @@ pub enum EpisodeKind {
     Evaluation,
 }
 
-/// The set of contacts during one control step. An environment may say which arms touched the table; it then does so for all
-/// of them.
+/// The set of contacts during one control step. An environment may say which arms touched the table; it then does so
+/// for all of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Contacts(u8);
 
@@ -27,7 +27,7 @@ impl Contacts {
     pub const ARM_ARM: Self = Self(1);
     /// Part of an arm touched the table.
     pub const ARM_TABLE: Self = Self(2);
-    /// Part of the first arm, or of the second one, touched the table. Includes [`ARM_TABLE`](Self::ARM_TABLE).
+    /// Part of this arm touched the table, by the arm's index. Includes [`ARM_TABLE`](Self::ARM_TABLE).
     pub const TABLE_OF: [Self; 2] = [Self(2 | 4), Self(2 | 8)];
 
     /// Returns `true` if this set includes all contacts of `other`.
@@ -42,13 +42,13 @@ impl Contacts {
         self.0 != 0
     }
 
-    /// Returns `true` if `arm` touched another arm or the table.
+    /// Returns `true` if `arm` touched the table, or any two arms touched each other: the set does not say which ones.
     #[must_use]
     pub fn involves(self, arm: ArmIndex) -> bool {
         self.contains(Self::ARM_ARM) || self.touches_table(arm)
     }
 
-    /// Returns `true` if `arm` touched the table, as every arm does unless the environment said which arms did.
+    /// Returns `true` if `arm` touched the table. If the environment did not say which arms did, all of them count.
     #[must_use]
     pub fn touches_table(self, arm: ArmIndex) -> bool {
         let knows_arms = Self::TABLE_OF.iter().any(|of_arm| self.contains(*of_arm));
@@ -64,15 +64,15 @@ impl Contacts {
         Self(self.0 & (Self::ARM_ARM.0 | Self::ARM_TABLE.0))
     }
 
-    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE), bits 2 and 3
-    /// tell which of two arms touched the table.
+    /// Returns the contacts as bits: bit 0 is [`ARM_ARM`](Self::ARM_ARM), bit 1 [`ARM_TABLE`](Self::ARM_TABLE), bits 2
+    /// and 3 are the arms of [`TABLE_OF`](Self::TABLE_OF).
     #[must_use]
     pub const fn bits(self) -> u8 {
         self.0
     }
 
-    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set, or an arm touched the table although none
-    /// did.
+    /// Returns the contacts that `bits` encode, or `None` if an undefined bit is set, or bit 2 or 3
+    /// without bit 1.
     #[must_use]
     pub const fn from_bits(bits: u8) -> Option<Self> {
         let contradicts = bits & 0b1100 != 0 && bits & 0b10 == 0;
@@ -111,11 +111,14 @@ pub struct Episode {
     pub advised_arms: Vec<u8>,
     /// Contacts during each step, shape `[n]`.
     pub contacts: Vec<Contacts>,
-    /// Units of the advice budget that the episode cost: one for each step with at least one advised arm.
+    /// Units of the advice budget that the episode claims: one for each step on which it has an advised arm. Under
+    /// [`AdviceUnit::SlotStep`](crate::AdviceUnit::SlotStep), the first advised episode of a slot claims one for each
+    /// step on which any episode of the slot has an advised arm, and the others claim none.
     pub advice_charged: u32,
-    /// Number of steps in which the link avoidance limited the motion of an arm, if the environment counts them.
+    /// Number of steps in which the link avoidance limited the motion of an arm; `None` if the environment does not
+    /// count them.
     pub avoidance_steps: Option<u32>,
-    /// Number of steps on which the teacher was asked, if the worker counts them.
+    /// Number of steps on which the teacher was asked; `None` if the worker does not count them.
     pub queried_steps: Option<u32>,
 }
 
@@ -167,7 +170,10 @@ impl Episode {
         &self.actions[step_idx * n..(step_idx + 1) * n]
     }
 
-    /// Returns what `arm` has achieved before step `step_idx`, in the order of its goal.
+    /// Returns what `arm` has achieved before step `step_idx`, in the order and the unit of its goal.
+    ///
+    /// # Panics
+    /// If `step_idx` exceeds the number of steps, or there is no such arm.
     #[must_use]
     pub fn achieved(&self, step_idx: usize, arm: ArmIndex) -> Cow<'_, [f32]> {
         self.layout.achieved_goal_of(arm).of(self.observation(step_idx))
@@ -191,8 +197,8 @@ impl Episode {
         self.ends_with(|observation| self.layout.is_success(observation, &self.goal))
     }
 
-    /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and the
-    /// episode does not end so: an object was lost.
+    /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and
+    /// the episode does not end so: an object was lost.
     #[must_use]
     pub fn lost_goal(&self) -> bool {
         let mut n_succeeding = 0;
@@ -210,14 +216,18 @@ impl Episode {
         (first..=n_steps).all(|step_idx| succeeds(self.observation(step_idx)))
     }
 
-    /// Returns `true` if the norm over all arms' distances together is within the tolerance after the last step.
+    /// Returns `true` if the norm over all arms' distances together is within the tolerance after the last step. Other
+    /// conditions of the task do not count.
     #[must_use]
     pub fn succeeded_jointly(&self) -> bool {
         self.joint_reward(self.n_steps() - 1) > -0.5
     }
 
-    /// Returns the joint reward of step `step_idx`: the [sparse reward](TaskSpec::sparse_reward) of all arms' goals
-    /// together.
+    /// Returns the joint reward of step `step_idx`, −1 or 0: the [sparse reward](TaskSpec::sparse_reward) of all arms'
+    /// goals together after the step.
+    ///
+    /// # Panics
+    /// If `step_idx` is not below the number of steps.
     #[must_use]
     pub fn joint_reward(&self, step_idx: usize) -> f32 {
         let achieved: Vec<f32> =
@@ -225,8 +235,8 @@ impl Episode {
         self.layout.sparse_reward(&achieved, &self.goal)
     }
 
-    /// Returns `true` if what any arm, or all arms together, achieved changed by more than the task's tolerance: in the
-    /// built-in tasks, if an object was displaced.
+    /// Returns `true` if what any arm, or all arms together, achieved differs by more than the task's tolerance between
+    /// the start and the end: in the built-in tasks, if an object ended more than 5 cm from where it was.
     #[must_use]
     pub fn moved(&self) -> bool {
         self.layout.is_displaced(self.observation(0), self.last_observation())

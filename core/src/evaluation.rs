@@ -8,8 +8,8 @@ pub const TEST_SEED: u64 = 777;
 /// The outcome of one evaluation episode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EpisodeOutcome {
-    /// Every object was within the tolerance of its goal, and the task's other conditions held, after the last step or, if
-    /// the task asks for more of them, after the last steps.
+    /// Every object was within the tolerance of its goal, and the task's other conditions held, after the last step or,
+    /// if the task asks for more of them, after the last steps.
     pub success: bool,
     /// The norm over all arms' distances together was within the tolerance after the last step.
     pub success_joint: bool,
@@ -21,7 +21,7 @@ pub struct EpisodeOutcome {
     pub table_contact: Option<bool>,
     /// The link avoidance limited the motion of an arm in at least one step; `None` if this is not known.
     pub avoidance: Option<bool>,
-    /// There was at least one arm–arm or arm–table contact.
+    /// There was at least one arm–arm or arm–table contact; `false` if the task does not report contacts.
     pub collided: bool,
     /// There was at least one such contact before all objects were at their goals to stay.
     pub collided_before_success: bool,
@@ -29,7 +29,7 @@ pub struct EpisodeOutcome {
     pub lost_goal: bool,
     /// At least one object was displaced; see [`Episode::moved`].
     pub moved: bool,
-    /// Sum of the joint rewards, undiscounted.
+    /// Sum of the joint rewards, undiscounted: from minus the number of steps to 0.
     pub episode_return: f32,
 }
 
@@ -80,7 +80,7 @@ fn steps_until_settled(episode: &Episode) -> usize {
         .map_or(0, |last_bad| last_bad + 1)
 }
 
-/// The Wilson score interval of a proportion, at a confidence of 95 %.
+/// The score interval of a proportion at a confidence of 95 % (Wilson 1927).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wilson {
     /// Lower end, in [0, 1].
@@ -133,7 +133,7 @@ pub struct EvaluationSummary {
     pub table_contact_rate: Option<f64>,
     /// Fraction in which the link avoidance limited the motion of an arm; `None` if this is not known.
     pub avoidance_rate: Option<f64>,
-    /// Fraction with at least one arm–arm or arm–table contact.
+    /// Fraction with at least one arm–arm or arm–table contact; 0 if the task does not report contacts.
     pub collision_rate: f64,
     /// Fraction with such a contact before all objects were at their goals to stay.
     pub collision_rate_before_success: f64,
@@ -141,7 +141,7 @@ pub struct EvaluationSummary {
     pub lost_goal_rate: f64,
     /// Fraction in which at least one object was displaced.
     pub moved: f64,
-    /// Mean sum of joint rewards.
+    /// Mean undiscounted sum of joint rewards.
     pub mean_return: f64,
 }
 

@@ -6,22 +6,25 @@ use std::fmt;
 use std::ops::Range;
 use std::str::FromStr;
 
-/// Length of one arm's part of an observation (section 4.1 of the paper).
+/// Length of one arm's part of an observation (section 4.1 and Table 1 of the paper). `tandem_sim::Env::observe` lists
+/// the numbers.
 pub const OBSERVATION_PER_ARM: usize = 28;
-/// Length of one arm's part of a goal: the desired position of its object, arm frame, metres.
+/// Length of one arm's part of a goal: the desired position (x, y, z) of its object, arm frame, metres.
 pub const GOAL_PER_ARM: usize = 3;
-/// Range of the end effector's position within its arm's part of an observation.
+/// Range of the end effector's position (x, y, z; arm frame, metres) within its arm's part of an observation.
 pub const HAND_POSITION: Range<usize> = 0..3;
-/// Range of the object's position within its arm's part of an observation.
+/// Range of the object's position (x, y, z; arm frame, metres) within its arm's part of an observation.
 pub const OBJECT_POSITION: Range<usize> = 3..6;
 /// Distance between the origins of the frames of two arms, metres. In the classic world these are the centres of their
 /// workspaces.
 ///
 /// The second arm is the first one rotated by 180° about z, so each arm's x axis points at the other arm.
 pub const WORKSPACE_DISTANCE_M: f32 = 0.24;
-/// Control steps per episode.
+/// Control steps per episode of the built-in tasks. The paper gives no number; the Fetch environments (Plappert et al.
+/// 2018), on which it builds, have 50.
 pub const EPISODE_STEPS: usize = 50;
-/// Distance between object and goal up to which the goal counts as achieved, metres.
+/// Distance between object and goal up to which the goal counts as achieved, metres: the paper's `ε`, for which it
+/// gives no value. This is that of the Fetch environments (Plappert et al. 2018), on which it builds.
 pub const GOAL_TOLERANCE_M: f32 = 0.05;
 
 /// A built-in manipulation task in one of three worlds. Push and pick and place are those of the paper (section 4.1).
@@ -225,7 +228,7 @@ impl FromStr for Task {
     }
 }
 
-/// The index of an arm within a layout, from 0.
+/// The index of an arm within a layout or a task, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ArmIndex(pub usize);
 
@@ -237,7 +240,7 @@ pub struct ArmIndex(pub usize);
 pub struct Layout {
     /// The task.
     pub task: Task,
-    /// Number of arms, at least 1.
+    /// Number of arms, 1 to [`MAX_ARMS`](crate::task::MAX_ARMS). The simulator has worlds for 1 and 2.
     pub n_arms: usize,
 }
 

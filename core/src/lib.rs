@@ -65,8 +65,8 @@
 //!
 //! The vector of several arms is the concatenation of the vectors of each arm. Positions are metres, angles radians and
 //! actions numbers in [−1, 1]; each arm's part is in the arm's own frame (origin on the table ahead of its base, x away
-//! from the base, z up). A policy for one arm can therefore use a part unchanged, which is how a one-arm teacher advises
-//! a two-arm student:
+//! from the base, z up). A policy for one arm can therefore use a part unchanged, which is how a one-arm teacher
+//! advises a two-arm student:
 //!
 //! ```
 //! # use tandem_core::{ArmIndex, Layout, Task};
@@ -78,8 +78,8 @@
 //!
 //! # Rewards
 //!
-//! The [`reward`] is sparse: in the built-in tasks, 0 if the objects are within 5 cm of their goals and −1 otherwise. One function serves
-//! success rates and hindsight relabelling alike.
+//! The [`reward`] of a step is sparse: in the built-in tasks, 0 if the distance from the goal is at most 5 cm and −1
+//! otherwise. One function serves success rates and hindsight relabelling alike.
 //!
 //! ```
 //! use tandem_core::reward::{REWARD_ACHIEVED, REWARD_PENDING, sparse_reward};
@@ -133,9 +133,10 @@
 //!
 //! # Modules in reading order
 //!
-//! [`task`], [`layout`] (the built-in tasks), [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and [`work`] (what a learner assigns
-//! to workers), [`strategy`] (the names of the strategies), [`advice`] (queries to a teacher and its answers), [`bounds`] (plausible ranges of observations),
-//! [`scene`] (snapshots for pictures and logs) and [`text`] (texts in messages).
+//! [`task`], [`layout`] (the built-in tasks), [`reward`], [`rng`], [`episode`], [`evaluation`]; then [`settings`] and
+//! [`work`] (what a learner assigns to workers), [`strategy`] (the names of the strategies), [`advice`] (queries to a
+//! teacher and its answers), [`bounds`] (plausible ranges of observations), [`scene`] (snapshots for pictures and logs)
+//! and [`text`] (texts in messages).
 #![warn(missing_docs)]
 
 pub mod advice;

@@ -1,7 +1,7 @@
 //! The sparse reward: 0 if the goal is achieved, −1 otherwise.
 //!
-//! A [`TaskSpec`](crate::TaskSpec) has the reward of any task. The functions that take a [`Layout`] or no task at all are
-//! those of the built-in tasks, for programs that step the simulator themselves.
+//! A [`TaskSpec`](crate::TaskSpec) has the reward of any task. The functions that take a [`Layout`] or no task at all
+//! are those of the built-in tasks, for programs that step the simulator themselves.
 
 use crate::layout::{GOAL_TOLERANCE_M, Layout};
 
@@ -20,7 +20,7 @@ pub fn distance(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>().sqrt()
 }
 
-/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of the built-in tasks (section 4.1 of the paper).
+/// Returns the sparse reward `−(‖achieved − desired‖ > ε)` of the built-in tasks (sections 2.3 and 4.1 of the paper).
 ///
 /// `ε` is [`GOAL_TOLERANCE_M`]. Given the goals of all arms, shape `[n_goal]`, the result is the joint reward; given
 /// those of one arm, it is the arm's own reward.
@@ -32,7 +32,8 @@ pub fn sparse_reward(achieved: &[f32], desired: &[f32]) -> f32 {
     sparse_reward_within(GOAL_TOLERANCE_M, distance(achieved, desired))
 }
 
-/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. At NaN the goal is not achieved.
+/// Returns the sparse reward at this distance from a goal, for any tolerance in the same unit. At NaN the goal is not
+/// achieved.
 #[must_use]
 pub fn sparse_reward_within(tolerance: f32, distance: f32) -> f32 {
     if distance <= tolerance { REWARD_ACHIEVED } else { REWARD_PENDING }
@@ -54,7 +55,11 @@ pub fn is_success(layout: Layout, observation: &[f32], goal: &[f32]) -> bool {
     })
 }
 
-/// Returns the goal that `observation` achieves: the positions of all objects, in arm order, shape `[n_goal]`.
+/// Returns the goal that `observation` achieves: the positions of all objects, in arm order, arm frames, metres, shape
+/// `[n_goal]`. This is `f_g` of the paper (section 2.3).
+///
+/// # Panics
+/// The iterator panics if `observation` is too short for `layout`.
 pub fn achieved_goal(layout: Layout, observation: &[f32]) -> impl Iterator<Item = f32> {
     layout.arms().flat_map(move |arm| observation[layout.achieved_goal_of(arm)].iter().copied())
 }

@@ -23,7 +23,8 @@ pub enum Stream {
     Normaliser = 4,
 }
 
-/// Returns the generator for `stream` of episode (or round, or network) `number` in the run with seed `run_seed`.
+/// Returns the generator for `stream` of episode (or round, or network) `number` in the run with seed `run_seed`:
+/// ChaCha8 with seed and number as its key.
 ///
 /// The seed does not depend on the worker that plays an episode or on the order in which episodes finish, so any
 /// episode can be replayed in isolation.
@@ -42,7 +43,7 @@ pub fn uniform(rng: &mut impl Rng, low: f32, high: f32) -> f32 {
     low + (high - low) * rng.random::<f32>()
 }
 
-/// Draws from the Bernoulli distribution: returns `true` with probability `probability`.
+/// Draws from the Bernoulli distribution: returns `true` with probability `probability`, in [0, 1].
 pub fn bernoulli(rng: &mut impl Rng, probability: f32) -> bool {
     rng.random::<f32>() < probability
 }

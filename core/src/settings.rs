@@ -98,7 +98,8 @@ pub struct WorldSettings {
     #[serde(default)]
     pub grasped_start_env_steps: u64,
     /// Resolution of the physics: 20, or 10 for quick tests. It is the number of physics steps per control step in the
-    /// classic world, and a quarter of it in the other ones. The test at the end of a run, `tandem eval` and films use 20.
+    /// classic world, and a quarter of it in the other ones. The test at the end of a run, `tandem eval` and films use
+    /// 20.
     pub substeps: u32,
     /// How much the world varies between training episodes, in [0, 1]: size, mass and friction of the objects, delay of
     /// the actions and noise of the observations. 0 is not at all, 1 is the full ranges. Former files have 0.

@@ -4,56 +4,60 @@
 use std::fmt;
 use std::str::FromStr;
 
-/// The threshold of a strategy whose name omits it.
+/// The threshold of a strategy whose name omits it: the largest of those that the paper compares (0.01, 0.05, 0.1).
 pub const DEFAULT_THRESHOLD: f32 = 0.1;
 /// The horizon of [`Strategy::JumpStart`] if its name omits it, control steps.
 pub const DEFAULT_HORIZON: u32 = 20;
 /// The largest horizon, control steps.
 pub const MAX_HORIZON: u32 = 100_000;
 
-/// A rule for when the teacher advises.
+/// A rule for when the teacher advises: those of the paper (section 3.2) with the names that it gives them in section
+/// 4.2, and three of other publications.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strategy {
     /// Never (NA).
     NoAdvice,
-    /// On every step (EA).
+    /// On every step (EA, procedure 1).
     EarlyAdvising,
-    /// On every step for the first half of the budget, then as [`Self::MistakeQ`] (EAMC).
+    /// On every step for the first half of the budget, then as [`Self::MistakeQ`] (EAMC). The paper does not say which
+    /// mistake-correcting procedure the second half has.
     EarlyThenMistakeQ {
         /// `t_I` in the second half.
         threshold: f32,
     },
-    /// When the teacher's action is worth more than the student's by a threshold (MC-Q).
+    /// For arms where the teacher values its own action above the student's by more than a threshold (MC-Q, procedure
+    /// 2).
     MistakeQ {
-        /// `t_I`, a difference of values.
+        /// `t_I`, a difference of the teacher's values, 0 or more (equation 10).
         threshold: f32,
     },
-    /// When the student's action is far from the teacher's (MC-ACT).
+    /// For arms where the student's action is farther from the teacher's than a threshold (MC-ACT, procedure 3).
     MistakeAction {
-        /// `α`, a Euclidean distance of actions.
+        /// `α`, a Euclidean distance between two actions of one arm, 0 or more (equation 11).
         alpha: f32,
     },
-    /// As [`Self::MistakeAction`], with the distance relative to the length of the teacher's action (MC-ACT-ABS).
+    /// As [`Self::MistakeAction`], with a threshold relative to the length of the teacher's action (MC-ACT-ABS).
     MistakeActionAbs {
-        /// `α`, a multiple of the length of the teacher's action.
+        /// `α`, a multiple of the length of the teacher's action, 0 or more (equation 11).
         alpha: f32,
     },
     /// On the first steps of an episode, fewer as the student succeeds (JSRL, Uchendu et al. 2023). The learner decides
     /// how many, and its workers do not ask after them.
     JumpStart {
-        /// `H`, the largest number of steps.
+        /// `H`, the largest number of control steps, 1 to [`MAX_HORIZON`].
         horizon: u32,
     },
     /// As [`Self::MistakeQ`] with the default threshold, on the steps whose value the student does not know: where an
     /// ensemble of its critics disagrees (after TS2C, Xue et al. 2023). Workers ask on these steps only.
     CriticDisagreement {
-        /// The standard deviation of the critics' values, of the arm where it is largest, above which to ask.
+        /// The standard deviation of the critics' values, of the arm where it is largest, above which to ask; 0 or
+        /// more.
         threshold: f32,
     },
     /// As [`Self::MistakeQ`], and the student's step before an intervention costs it a reward of 1 (RLIF, Luo et al.
     /// 2023).
     InterventionFeedback {
-        /// `t_I`, a difference of values.
+        /// `t_I`, a difference of the teacher's values, 0 or more.
         threshold: f32,
     },
 }

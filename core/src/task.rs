@@ -34,6 +34,10 @@ pub const MAX_NUMBERS: usize = 4096;
 pub const MAX_EPISODE_STEPS: usize = 10_000;
 
 /// A checked task. It determines the length of every vector and the part of each arm; a clone is cheap.
+///
+/// # Panics
+/// Methods panic if the index of an arm is not below [`n_arms`](Self::n_arms), or a vector is shorter than the task
+/// says.
 #[derive(Debug, Clone)]
 pub struct TaskSpec(Arc<Checked>);
 
@@ -195,8 +199,8 @@ impl TaskSpec {
         &self.0.arms[arm.0].position
     }
 
-    /// Returns the indices, in an observation, of the coordinates of [`Self::position_of`] along the perpendicular axis,
-    /// which may be empty: see [`ArmDescription::lateral`].
+    /// Returns the indices, in an observation, of the coordinates of [`Self::position_of`] along the perpendicular
+    /// axis, which may be empty: see [`ArmDescription::lateral`].
     #[must_use]
     pub fn lateral_of(&self, arm: ArmIndex) -> &Part {
         &self.0.arms[arm.0].lateral
@@ -332,15 +336,16 @@ impl TaskSpec {
         sparse_reward_within(self.tolerance(), self.distance(achieved, desired))
     }
 
-    /// Returns the distance of `arm` from its goal in `observation`.
+    /// Returns the distance between what `arm` achieves in `observation`, shape `[n_observation]`, and its part of
+    /// `goal`, shape `[n_goal]`, in the unit of the goal.
     #[must_use]
     pub fn goal_distance_of(&self, arm: ArmIndex, observation: &[f32], goal: &[f32]) -> f32 {
         let achieved = self.achieved_goal_of(arm).of(observation);
         self.distance(&achieved, &self.goal_of(arm).of(goal))
     }
 
-    /// Returns the distance of each arm from its goal in `observation`, then that from the part of the goal common to all
-    /// arms if there is one.
+    /// Returns the [distance](Self::goal_distance_of) of each arm from its goal, then that from the part of the goal
+    /// common to all arms if there is one: shape `[n_arms]` or `[n_arms + 1]`.
     #[must_use]
     pub fn goal_distances(&self, observation: &[f32], goal: &[f32]) -> Vec<f32> {
         let of_arms = self.arms().map(|arm| self.goal_distance_of(arm, observation, goal));
@@ -373,8 +378,8 @@ impl TaskSpec {
         self.arm_reaches_goal(arm, observation, goal) && self.arm_meets_conditions(arm, observation)
     }
 
-    /// Returns true if `arm` satisfies all conditions of success other than the distance to the goal: it holds its object
-    /// and meets the further conditions, as far as the task has any.
+    /// Returns true if `arm` satisfies all conditions of success other than the distance to the goal: it holds its
+    /// object and meets the further conditions, as far as the task has any.
     ///
     /// # Panics
     /// If `observation` is too short.
@@ -399,7 +404,7 @@ impl TaskSpec {
     }
 
     /// Returns true if what any arm, or all arms together, achieved differs by more than the tolerance between two
-    /// observations: in the built-in tasks, if an object was displaced.
+    /// observations, shape `[n_observation]`: in the built-in tasks, if an object was displaced by more than 5 cm.
     #[must_use]
     pub fn is_displaced(&self, first: &[f32], later: &[f32]) -> bool {
         let has_moved =
@@ -414,7 +419,8 @@ impl TaskSpec {
             || self.distance(&achieved.of(observation), &desired.of(goal)) <= self.tolerance()
     }
 
-    /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects them.
+    /// Returns the parts of all arms of an observation, concatenated in arm order, as a teacher for one arm expects
+    /// them.
     #[must_use]
     pub fn observation_in_arm_order(&self, observation: &[f32]) -> Vec<f32> {
         self.in_arm_order(observation, Self::observation_of)

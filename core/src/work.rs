@@ -19,8 +19,8 @@ pub struct RunTerms {
     pub exploration: Exploration,
     /// Initial states and physics.
     pub world: WorldSettings,
-    /// Whether the action in evaluation episodes is the mean, before tanh, of the actor's action and of that for the scene
-    /// with the order of its arms reversed.
+    /// Whether the action in evaluation episodes is the mean, before tanh, of the actor's action and of that for the
+    /// scene with the order of its arms reversed.
     pub symmetrized_evaluation: bool,
 }
 
@@ -100,11 +100,11 @@ pub struct PublishedActor {
     pub actor: Vec<f32>,
     /// Mean of observations, shape `[n_observation]`.
     pub observation_mean: Vec<f32>,
-    /// Standard deviation of observations, shape `[n_observation]`.
+    /// Standard deviation of observations, above 0, shape `[n_observation]`.
     pub observation_std: Vec<f32>,
     /// Mean of goals, shape `[n_goal]`.
     pub goal_mean: Vec<f32>,
-    /// Standard deviation of goals, shape `[n_goal]`.
+    /// Standard deviation of goals, above 0, shape `[n_goal]`.
     pub goal_std: Vec<f32>,
     /// When to ask for advice; `None` means always.
     pub gate: Option<PublishedGate>,

@@ -38,6 +38,9 @@ pub struct BridgeTerms {
 impl Site {
     /// Returns the site of a bridge, whose button calls `stop`. It encodes each state of `views` once, in a task of the
     /// runtime that calls it, until the sender is dropped.
+    ///
+    /// # Panics
+    /// If it is called outside a tokio runtime.
     #[must_use]
     pub fn of_bridge(
         terms: BridgeTerms,

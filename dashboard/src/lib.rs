@@ -7,8 +7,8 @@
 //! The crate knows snapshots only: where they come from, and what they cost, is decided by the caller. A snapshot is
 //! encoded once for all viewers, and a viewer that does not keep up receives the newest one next.
 //!
-//! Reading order: `run` (from snapshots to documents) with `document`, `events` and `playback`, `sweep`, `bridge`, `page`
-//! (HTML), `site` (routes), `access` (who may see a page), `server` (connections).
+//! Reading order: `run` (from snapshots to documents) with `document`, `events` and `playback`, `sweep`, `bridge`,
+//! `page` (HTML), `site` (routes), `access` (who may see a page), `server` (connections).
 #![warn(missing_docs)]
 
 mod access;

@@ -20,6 +20,9 @@ const MAX_INACTIVE_WORKERS: usize = 32;
 impl Site {
     /// Returns the site of a run. It encodes each snapshot of `views` once, in a task of the runtime that calls it,
     /// until the sender is dropped.
+    ///
+    /// # Panics
+    /// If it is called outside a tokio runtime.
     #[must_use]
     pub fn of_run(views: watch::Receiver<RunView>) -> Self {
         let mut feed = Feed::default();

@@ -112,6 +112,9 @@ pub struct SweepResult {
 impl Site {
     /// Returns the site of a sweep. It encodes each snapshot of `views` once, in a task of the runtime that calls it,
     /// until the sender is dropped.
+    ///
+    /// # Panics
+    /// If it is called outside a tokio runtime.
     #[must_use]
     pub fn of_sweep(views: watch::Receiver<SweepView>) -> Self {
         let mut feed = Feed::default();

@@ -121,8 +121,8 @@ impl Live {
         is_success(self.layout(), &self.observation, self.env.goal())
     }
 
-    /// Returns whether every object is where the policy has learned to act: on or above the table, in or near the area of
-    /// its arm's goals.
+    /// Returns whether every object is where the policy has learned to act: on or above the table, in or near the area
+    /// of its arm's goals.
     #[must_use]
     pub fn is_in_reach(&self) -> bool {
         const MARGIN_M: f32 = 0.08;

@@ -128,7 +128,8 @@ impl Page {
         Ok(description)
     }
 
-    /// Returns the [`drawing`] of the policy's world, or of the recorded episode `position` control steps after its start.
+    /// Returns the [`drawing`] of the policy's world, or of the recorded episode `position` control steps after its
+    /// start.
     ///
     /// # Errors
     /// If nothing is loaded.

@@ -37,10 +37,12 @@ const ROUNDING: f64 = 1e-9;
 /// Velocities below this count as rest, radians per second.
 const REST_RADPS: f64 = 1e-6;
 
-/// Checks that `motion` keeps every limit. `at` gives the arms' present joint angles, radians, arm by arm.
+/// Checks that `motion` keeps every limit. `at` gives the arms' present joint angles, radians, arm by arm: the motion
+/// begins there, within [`CheckSettings::start_rad`]. It begins and ends at rest.
 ///
 /// # Errors
-/// Returns the first limit that the motion violates, and when.
+/// Returns the first limit that the motion violates, and when. Settings that are out of range, and numbers of arms,
+/// joints or samples that do not match, are refused too.
 pub fn check(
     cell: &WorkCell,
     motion: &Motion,

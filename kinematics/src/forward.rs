@@ -35,20 +35,20 @@ impl ForwardKinematics {
         Self { frames, n_joints }
     }
 
-    /// Returns the pose of the tool, metres. The fingers close along its x axis, and the gripper points along its z
-    /// axis.
+    /// Returns the pose of the tool in the base frame, metres. The fingers close along its x axis, and the gripper
+    /// points along its z axis.
     #[must_use]
     pub fn tool(&self) -> &Isometry3<f64> {
         &self.frames[self.n_joints + 1]
     }
 
-    /// Returns the position of the tool's origin, metres.
+    /// Returns the position of the tool's origin in the base frame, metres.
     #[must_use]
     pub fn tool_m(&self) -> Point3<f64> {
         self.tool().translation.vector.into()
     }
 
-    /// Returns the direction in which the gripper points, a unit vector.
+    /// Returns the direction in which the gripper points, a unit vector of the base frame.
     #[must_use]
     pub fn pointing(&self) -> Vector3<f64> {
         self.tool().rotation * Vector3::z()
@@ -61,7 +61,7 @@ impl ForwardKinematics {
         libm::atan2(libm::hypot(pointing.x, pointing.y), -pointing.z)
     }
 
-    /// Returns the position of `anchor`, metres.
+    /// Returns the position of `anchor` in the base frame, metres.
     ///
     /// # Panics
     /// If the anchor's frame is out of range.
@@ -75,7 +75,7 @@ impl ForwardKinematics {
         &self.frames[joint + 1].rotation
     }
 
-    /// Returns the Jacobian of the tool's position, metres per radian.
+    /// Returns the Jacobian of the tool's position, base frame, metres per radian.
     #[must_use]
     pub fn position_jacobian(&self) -> PositionJacobian {
         let tool_m = self.tool().translation.vector;
@@ -98,8 +98,8 @@ impl ForwardKinematics {
         Some(inverse * terms.fold(Vector3::zeros(), |sum, term| sum + term))
     }
 
-    /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), metres per
-    /// second.
+    /// Returns the velocity of the tool's origin at joint velocities `velocities` (radians per second), base frame,
+    /// metres per second.
     #[must_use]
     pub fn tool_velocity(&self, velocities: &Joints) -> Vector3<f64> {
         let jacobian = self.position_jacobian();

@@ -6,7 +6,8 @@ use std::ops::{Deref, DerefMut};
 /// The largest number of joints of an arm.
 pub const MAX_JOINTS: usize = 6;
 
-/// One value per joint of an arm, base to wrist: angles in radians, or velocities in radians per second.
+/// One value per joint of an arm, base to wrist: angles in radians, velocities in radians per second, or torques in
+/// newton metres.
 ///
 /// Dereferences to a slice of `n_joints` values.
 #[derive(Clone, Copy, PartialEq)]
@@ -42,7 +43,7 @@ impl Joints {
         self.iter().all(|value| value.is_finite())
     }
 
-    /// Returns the largest absolute difference to `other` over all joints, in the unit of the values.
+    /// Returns the largest absolute difference to `other`, in the unit of the values, over the joints that both have.
     #[must_use]
     pub fn largest_difference(&self, other: &Self) -> f64 {
         self.iter().zip(other.iter()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)

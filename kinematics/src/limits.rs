@@ -2,10 +2,10 @@
 
 /// Limits on a motion, shared by the planner and the check.
 ///
-/// Ranges and speeds of the joints are the arm's own ([`Joint`](crate::model::Joint)).
+/// Numbers are finite and above 0. Ranges and speeds of the joints are the arm's own ([`Joint`](crate::model::Joint)).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Largest speed of the tool's origin, metres per second. The paper's arms move at 0.20.
+    /// Largest speed of the tool's origin, metres per second. The paper's arms move at 0.20 (its Table 3).
     pub tool_speed_mps: f64,
     /// Time in which a joint may accelerate from rest to its largest speed, seconds. It defines the largest
     /// acceleration.

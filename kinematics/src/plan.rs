@@ -57,7 +57,8 @@ pub type Waypoint = Vec<ArmWaypoint>;
 pub struct PlanSettings {
     /// Limits that the trajectory keeps.
     pub limits: Limits,
-    /// Shortest time from one waypoint to the next, seconds: 0.04 in the training world.
+    /// Shortest time from one waypoint to the next, seconds, above 0: the control step of the training world, 0.04 in
+    /// the classic one.
     pub step_s: f64,
     /// Share of the largest possible speed, in (0, 1].
     pub speed: f64,
@@ -75,7 +76,8 @@ impl Default for PlanSettings {
 /// those at the first waypoint and selects the branch of the inverse kinematics.
 ///
 /// # Errors
-/// Returns the first waypoint that an arm cannot reach, or the first invalid input.
+/// Returns the first setting, number of arms or joints, or waypoint that is invalid; otherwise the first waypoint that
+/// an arm cannot reach, or on the way to which a joint would jump.
 pub fn plan(
     cell: &WorkCell,
     waypoints: &[Waypoint],

@@ -20,8 +20,8 @@ const FINGER_AHEAD_M: f64 = 0.021;
 const OPEN_M: f64 = 0.062;
 
 impl WorkCell {
-    /// Returns the arms at joint angles `angles` (radians, arm by arm) with grippers open by `openings` (0 to 1), and
-    /// the table. There are no objects and no goals.
+    /// Returns the arms at joint angles `angles` (radians, arm by arm) with grippers open by `openings` (0 to 1, arm by
+    /// arm), and the table, world frame. `time_s` becomes the scene's time, seconds. There are no objects and no goals.
     ///
     /// # Panics
     /// If an arm has another number of angles than joints.
@@ -45,7 +45,8 @@ impl WorkCell {
 }
 
 impl PlacedArm {
-    /// Returns the arm's shapes at joint angles `angles` (radians) with its gripper open by `opening` (0 to 1).
+    /// Returns the arm's shapes, world frame, at joint angles `angles` (radians) with its gripper open by `opening` (0
+    /// to 1).
     ///
     /// # Panics
     /// If `angles` has another number of joints than the arm.

@@ -1,9 +1,9 @@
 //! The relation between the training world's frames and the arms' base frames.
 //!
-//! **The classic training world** gives every number in an arm's own frame: origin on the table in the centre of the arm's
-//! workspace, x away from its base, z up, metres. The second arm's frame is the first's rotated by half a turn. Objects
-//! and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves within 0.20
-//! m, 0.25 m and 0.35 m. The gripper's fingers close along y.
+//! **The classic training world** gives every number in an arm's own frame: origin on the table in the centre of the
+//! arm's workspace, x away from its base, z up, metres. The second arm's frame is the first's rotated by half a turn.
+//! Objects and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves
+//! within 0.20 m, 0.25 m and 0.35 m. The gripper's fingers close along y.
 //!
 //! **The Mico with four joints** points nearly down in a narrow ring only (see [`inverse`](crate::inverse)), and the
 //! training world's base, 0.40 m behind the centre, is outside that ring. A [`TaskFrame`] scales own frames about their

@@ -1,7 +1,8 @@
 //! The learner: the training loop over rounds, checkpoints, evaluations, and the `Learner` service.
 //!
-//! The learning algorithm is in `tandem-rl`. The crate does not know how an episode is simulated, how many workers
-//! there are or how a teacher decides.
+//! Start at [`serve`]: it runs a [`LearnerConfig`], a run file and the addresses of its peers, on a thread of its own,
+//! serves its workers meanwhile and returns a [`RunOutcome`]. The learning algorithm is in `tandem-rl`. The crate does
+//! not know how an episode is simulated, how many workers there are or how a teacher decides.
 //!
 //! Reading order: [`work_queue`] (the assignment of slots to workers), [`evaluation_store`] (results of evaluations),
 //! [`checkpoint`], [`settings`] (settings that a resumed run keeps), [`service`] (the gRPC service, next to the

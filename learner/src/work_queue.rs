@@ -19,11 +19,11 @@ pub use worker::{SilentWorker, Worker};
 
 /// A worker that has not called for this time counts as dead: its slots return to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
-/// A slot that has been assigned for this time, and for twice the recent mean, is also assigned to a second worker that
-/// is idle.
+/// A slot that has been assigned for this time, and for twice the recent mean but at most [`SILENT_AFTER`], is also
+/// assigned to a second worker that is idle.
 pub const COVER_AFTER: Duration = Duration::from_secs(3);
-/// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been slow
-/// and not dead.
+/// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been
+/// slow and not dead.
 pub const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most workers in a run.
 pub const MAX_WORKERS: usize = 10_000;
@@ -89,8 +89,9 @@ pub enum JoinError {
 impl WorkQueue {
     /// Adds a worker that calls over `connection` and returns its number.
     ///
-    /// A full queue removes a worker that has joined and done nothing else: first one of the same connection if that
-    /// has too many, then one that does not ask for work, then one of the connection that has most of them.
+    /// A connection with too many workers that have delivered nothing loses the oldest of them that plays nothing. A
+    /// full queue removes the oldest worker that has not asked for work within [`ASK_WITHIN`], otherwise the one that
+    /// has been silent longest, otherwise one of the connection that has most workers without a delivery.
     ///
     /// # Errors
     /// When there are too many workers and none of them can be removed.
@@ -303,8 +304,8 @@ impl WorkQueue {
         (2 * self.mean_duration.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER)
     }
 
-    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may have
-    /// been removed meanwhile.
+    /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may
+    /// have been removed meanwhile.
     ///
     /// # Errors
     /// When the worker has never joined or there never was such a slot.

@@ -14,8 +14,8 @@ pub enum Pacing {
 impl Pacing {
     /// Waits for `message`, the next message from a thread to the calling task.
     ///
-    /// Under [`Self::Lockstep`] this blocks the runtime, so the thread must send without waiting for another task of the
-    /// runtime.
+    /// Under [`Self::Lockstep`] this blocks the runtime, so the thread must send without waiting for another task of
+    /// the runtime.
     pub async fn next<F: Future>(self, message: F) -> F::Output {
         match self {
             Self::Concurrent => message.await,

@@ -95,7 +95,8 @@ impl Retrier {
         Self { backoff, operation, n_failures: 0, logged: String::new() }
     }
 
-    /// Returns the outcome of a call, or `None` if the call is to be repeated. In that case the pause is over.
+    /// Returns the outcome of a call, or `None` if the call is to be repeated: after an error that is
+    /// [`Retryability::Transient`], once the pause is over.
     pub async fn settle<T>(&mut self, outcome: Result<T, Status>) -> Option<Result<T, Status>> {
         match outcome {
             Err(status) if Retryability::of(status.code()) == Retryability::Transient => {

@@ -51,9 +51,10 @@ pub struct BoundNetwork {
 impl BoundNetwork {
     /// Binds the network of `model` to `layout`.
     ///
-    /// Inputs are recognised by their names: `observation` (or `obs`, `state`), `goal` (or `desired_goal`), `achieved_goal`,
-    /// which is a part of the observation, and `action` (or `actions`). A model with one input, or whose `observation`
-    /// is that long, takes observation and goal, and as a critic the action, concatenated in this order.
+    /// Inputs are recognised by their names: `observation` (or `obs`, `state`), `goal` (or `desired_goal`),
+    /// `achieved_goal`, which is a part of the observation, and `action` (or `actions`). A model with one input, or
+    /// whose `observation` is that long, takes observation and goal, and as a critic the action, concatenated in this
+    /// order.
     ///
     /// # Errors
     /// When an input has another name or length, or an actor's output is not as long as an action.

@@ -1,7 +1,7 @@
 //! Models of a policy's networks.
 //!
-//! A model normalises and clips its inputs itself, takes batches of any size, and needs an ONNX runtime of 2021 or later
-//! (IR version 7, operators of version 13).
+//! A model normalises and clips its inputs itself, takes batches of any size, and needs an ONNX runtime of 2021 or
+//! later (IR version 7, operators of version 13).
 
 use prost::Message as _;
 use tandem_policy::normalizer::CLIP;

@@ -1,9 +1,9 @@
 //! From models to a policy.
 //!
-//! A policy file has one form of network (`docs/policy-format.md`): inputs clipped after normalisation, ReLU between layers
-//! of equal width, tanh after the actor's last. Other networks are brought to this form where that changes no more than
-//! the rounding of their outputs: smaller layers are padded with units of weight 0, missing layers are identities, a
-//! constant factor moves into the next layer's weight.
+//! A policy file has one form of network (`docs/policy-format.md`): inputs clipped after normalisation, ReLU between
+//! layers of equal width, tanh after the actor's last. Other networks are brought to this form where that changes no
+//! more than the rounding of their outputs: smaller layers are padded with units of weight 0, missing layers are
+//! identities, a constant factor moves into the next layer's weight.
 
 mod columns;
 mod layers;
@@ -77,7 +77,7 @@ pub fn import(
 /// [`import`] concerns both models.
 ///
 /// # Errors
-/// When it does not, or cannot.
+/// When the network does not fit, or a policy file cannot represent it.
 pub fn check(model: &Model, role: Role, layout: &TaskSpec) -> Result<(), ModelError> {
     let network = Converted::new(&BoundNetwork::new(model, role, layout)?, role)?;
     match role {

@@ -7,7 +7,8 @@
 //! - [`BoundNetwork`] runs a model on the vectors of a [`Layout`](tandem_core::Layout).
 //! - [`import()`] converts models to a policy, if a policy file can represent them.
 //!
-//! The crate contains the part of ONNX that it needs and depends on no ONNX runtime. `docs/onnx.md` describes the models.
+//! The crate contains the part of ONNX that it needs and depends on no ONNX runtime. `docs/onnx.md` describes the
+//! models.
 //!
 //! ```
 //! use tandem_onnx::{BoundNetwork, Model, Role, export};

@@ -37,8 +37,8 @@ impl View {
         self.0.project(DVec3::from(point.map(f64::from)))
     }
 
-    /// Returns the distance of `point` (world frame, metres) from the camera along the direction of the view, metres. Points
-    /// with larger depths are behind.
+    /// Returns the distance of `point` (world frame, metres) from the camera along the direction of the view, metres.
+    /// Points with larger depths are behind.
     #[must_use]
     pub fn depth_m(&self, point: Point) -> f64 {
         (DVec3::from(point.map(f64::from)) - self.0.eye).dot(self.0.forward)
@@ -56,8 +56,8 @@ impl View {
         self.0.eye.to_array()
     }
 
-    /// Returns the point at height `z_m` (world frame, metres) that is drawn at this place of the picture, pixels; `None`
-    /// if the place is above the horizon.
+    /// Returns the point at height `z_m` (world frame, metres) that is drawn at this place of the picture, pixels;
+    /// `None` if the place is above the horizon.
     #[must_use]
     #[expect(clippy::cast_possible_truncation, reason = "metres")]
     pub fn at_height(&self, [x, y]: [f64; 2], z_m: f32) -> Option<Point> {

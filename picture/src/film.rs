@@ -47,7 +47,7 @@ pub struct FilmStep {
 /// rest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FilmEpisode {
-    /// Text in the upper left corner. Its characters are ASCII.
+    /// Text in the upper left corner, in ASCII.
     pub title: String,
     /// The moments in order.
     pub steps: Vec<FilmStep>,
@@ -79,11 +79,11 @@ fn has_moved_by(one: &Scene, other: &Scene) -> f32 {
 /// Size and speed of a film.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Film {
-    /// Width of a picture, pixels.
+    /// Width of a picture, 64 to 4096 pixels.
     pub width: usize,
-    /// Height of a picture, pixels.
+    /// Height of a picture, 64 to 4096 pixels.
     pub height: usize,
-    /// Ratio of simulated time to the time of the film: 0.5 shows an episode at half its speed.
+    /// Ratio of simulated time to the time of the film, 0.05 to 20: 0.5 shows an episode at half its speed.
     pub speed: f64,
 }
 

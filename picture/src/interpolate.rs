@@ -2,7 +2,8 @@
 
 use tandem_core::scene::{ArmScene, Capsule, Cuboid, Point, Scene};
 
-/// Returns the scene at `share` of the way from `before` to `after`, in [0, 1]. Both are scenes of the same world.
+/// Returns the scene at `share`, in [0, 1], of the way from `before` to `after`, which are scenes of the same world.
+/// Time, links, hands, end effectors and objects are interpolated; all else is that of `before`.
 #[must_use]
 pub fn between(before: &Scene, after: &Scene, share: f32) -> Scene {
     let arms = before.arms.iter().zip(&after.arms);

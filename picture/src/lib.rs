@@ -1,9 +1,10 @@
 //! Pictures and films of simulated scenes, computed by casting rays: the table, arms, objects and goals in perspective,
 //! with shadows.
 //!
-//! [`render`] returns the pixels of one scene, and a [`View`] where its points are in them. [`film_gif`], [`film_strip`]
-//! and [`picture_png`] return files: an animation of episodes, eight pictures of an episode side by side, and a single
-//! picture. The same scenes give the same bytes, on any number of threads.
+//! Scenes are those of [`tandem_core::scene`]. [`render`] returns the pixels of one scene, and a [`View`] where its
+//! points are in them. [`film_gif`], [`film_strip`] and [`picture_png`] return files: an animation of episodes, eight
+//! pictures of an episode side by side, and a single picture. The same scenes give the same bytes, on any number of
+//! threads.
 #![warn(missing_docs)]
 
 mod camera;

@@ -60,7 +60,7 @@ const BLOCKER_MARGIN_M: f64 = 1e-3;
 /// Index of the table among the bodies.
 const TABLE: usize = 0;
 
-/// Draws `scene`.
+/// Draws `scene` in a picture of `width` times `height` pixels, as [`View::of`](crate::View::of) projects it.
 #[must_use]
 pub fn render(scene: &Scene, width: usize, height: usize) -> Raster {
     render_achieved(scene, &[], width, height)

@@ -22,7 +22,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// Creates an optimiser for `n_parameters` parameters.
+    /// Creates an optimiser for `n_parameters` parameters. `learning_rate` is Adam's step size `alpha`, above 0.
     #[must_use]
     pub fn new(n_parameters: usize, learning_rate: f32) -> Self {
         Self {
@@ -86,7 +86,8 @@ impl Adam {
         [&self.first_moments, &self.second_moments]
     }
 
-    /// Restores the state of an optimiser: its number of steps and its [`moments`](Self::moments).
+    /// Restores the state of an optimiser: its number of steps and its [`moments`](Self::moments). The learning rate
+    /// stays.
     ///
     /// # Panics
     /// If a vector has another length.
@@ -159,8 +160,8 @@ impl WithSimd for Kernel<'_, '_> {
 
 /// Moves `target` toward `online`: `target = keep * target + (1 - keep) * online`.
 ///
-/// Both are flat parameter vectors of the same network, shape `[n_parameters]`. `keep` is Spinning Up's `polyak`;
-/// the `tau` of CleanRL and Stable-Baselines3 is `1 - keep`.
+/// Both are flat parameter vectors of the same network, shape `[n_parameters]` (section 4.2 of the paper). `keep`, in
+/// [0, 1], is Spinning Up's `polyak`; the `tau` of CleanRL and Stable-Baselines3 is `1 - keep`.
 ///
 /// # Panics
 /// If the two vectors differ in length.

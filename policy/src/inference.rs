@@ -59,7 +59,8 @@ impl Inputs {
     }
 }
 
-/// An actor, which chooses actions.
+/// An actor `π(s, g)`, which chooses actions: a network of shape [`MlpShape::actor`] over normalised observation and
+/// goal, followed by tanh.
 ///
 /// The action for an observation has the same bits in any batch, and on every machine with fused multiply-add.
 #[derive(Debug, Clone)]
@@ -71,10 +72,11 @@ pub struct Actor {
 }
 
 impl Actor {
-    /// Creates an actor from parameters that a learner published.
+    /// Creates an actor, with its gate if there is one, from parameters that a learner published.
     ///
     /// # Errors
-    /// Returns an error if the parameters do not match `layout` or are not finite.
+    /// Returns an error if a size is out of range, a vector does not have the length that follows from `layout` and the
+    /// sizes, a number is not finite, or a standard deviation is not above 0.
     pub fn new(layout: impl Into<TaskSpec>, published: PublishedActor) -> Result<Self, Error> {
         let layout = layout.into();
         let gate = QueryGate::new(&layout, &published)?;
@@ -136,7 +138,8 @@ impl Actor {
     }
 }
 
-/// A critic, which estimates the expected discounted return of actions, one number per head.
+/// A critic `Q(s, g, a)`, which estimates the expected discounted return of actions (equation 2 of the paper), one
+/// number per head, in units of reward: a network of shape [`MlpShape::critic`].
 ///
 /// As for [`Actor`], the bits of a row do not depend on the batch.
 #[derive(Debug, Clone)]
@@ -150,7 +153,8 @@ impl Critic {
     /// Creates a critic from `parameters`, shape `[n_parameters]` of `shape`, with the normalisation of its inputs.
     ///
     /// # Errors
-    /// Returns an error if the parameters do not match `layout` or are not finite.
+    /// Returns an error if a size is out of range, the input of `shape` or the length of a vector does not match
+    /// `layout`, a number is not finite, or a standard deviation is not above 0.
     pub fn new(
         layout: impl Into<TaskSpec>,
         shape: &MlpShape,

@@ -16,7 +16,8 @@ pub use parts::{
 
 /// The sizes of a network: input, hidden layers of equal width, output.
 ///
-/// Its parameters are one flat vector: for each layer the weight, shape `[out, in]`, then the bias, shape `[out]`.
+/// Its parameters are one flat vector: for each layer the weight, shape `[out, in]`, row-major, then the bias, shape
+/// `[out]`. Layers are numbered from 0; the last one, number `n_hidden_layers`, is the output layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MlpShape {
     /// Length of an input row.
@@ -143,7 +144,8 @@ impl Workspace {
     }
 }
 
-/// Computes `output`, shape `[batch, n_output]`, from `input`, shape `[batch, n_input]`.
+/// Computes `output`, shape `[batch, n_output]`, from `input`, shape `[batch, n_input]`, and stores the activations in
+/// `workspace`. `parameters` has shape `[n_parameters]`.
 ///
 /// # Panics
 /// If a size does not match `shape` or the batch exceeds the workspace.

@@ -1,8 +1,9 @@
 //! Input normalisation with a running mean and standard deviation.
 
-/// Lower bound on standard deviations.
+/// Lower bound on standard deviations, in the unit of the numbers, as in the HER reference implementation (OpenAI
+/// baselines).
 pub const STD_FLOOR: f32 = 0.01;
-/// Normalised numbers are clipped to `[-CLIP, CLIP]`.
+/// Normalised numbers are clipped to `[-CLIP, CLIP]`, as in the HER reference implementation (OpenAI baselines).
 pub const CLIP: f32 = 5.0;
 
 /// The mean and standard deviation by which inputs are normalised.
@@ -47,7 +48,7 @@ pub struct NormalizerState {
     pub sum_of_squares: Vec<f64>,
 }
 
-/// The running mean and standard deviation of all rows so far.
+/// The running mean and population standard deviation of all rows so far. Deviations below [`STD_FLOOR`] count as that.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normalizer {
     state: NormalizerState,
@@ -76,7 +77,8 @@ impl Normalizer {
         normalizer
     }
 
-    /// Creates a normaliser as if it had seen `count` rows with the mean and standard deviation of `snapshot`.
+    /// Creates a normaliser as if it had seen `count` rows with the mean and standard deviation of `snapshot`; without
+    /// rows it only clips.
     #[must_use]
     pub fn from_snapshot(snapshot: &NormalizerSnapshot, count: u64) -> Self {
         let rows = count as f64;

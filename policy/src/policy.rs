@@ -26,7 +26,7 @@ pub struct Policy {
     pub n_hidden: usize,
     /// Number of hidden layers of both networks.
     pub n_hidden_layers: usize,
-    /// Number of values that the critic returns: 1, or one per arm.
+    /// Number of values that the critic returns: 1, of the joint reward, or one per arm.
     pub n_heads: usize,
     /// Parameters of the actor, shape `[n_parameters]` of [`Policy::actor_shape`].
     pub actor: Vec<f32>,
@@ -73,7 +73,7 @@ impl Policy {
     /// Creates the actor, which chooses actions.
     ///
     /// # Errors
-    /// Returns an error if a vector has the wrong length or contains an invalid number.
+    /// Returns an error if a size is out of range, or a vector has the wrong length or contains an invalid number.
     pub fn actor(&self) -> Result<Actor, Error> {
         Actor::new(&self.layout, self.published(0))
     }
@@ -81,7 +81,7 @@ impl Policy {
     /// Creates the critic, which values actions.
     ///
     /// # Errors
-    /// Returns an error if a vector has the wrong length or contains an invalid number.
+    /// Returns an error if a size is out of range, or a vector has the wrong length or contains an invalid number.
     pub fn critic(&self) -> Result<Critic, Error> {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());
@@ -114,8 +114,8 @@ impl Policy {
     /// Validates sizes, lengths and numbers.
     ///
     /// # Errors
-    /// Returns an error if a size is out of range, the critic has neither one value nor one for each arm, a vector has the
-    /// wrong length, a number is not finite, or a standard deviation is not positive.
+    /// Returns an error if a size is out of range, the critic has neither one value nor one for each arm, a vector has
+    /// the wrong length, a number is not finite, or a standard deviation is not positive.
     pub fn check(&self) -> Result<(), Error> {
         check_network_size(self.n_hidden, self.n_hidden_layers)?;
         check_size("n_heads", self.n_heads, MAX_HEADS)?;
@@ -158,7 +158,8 @@ impl Policy {
     }
 }
 
-/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and of the normalisation alone.
+/// Returns the digest of a published actor: [`Policy::digest`] over the tensors of the actor and of the normalisation
+/// alone.
 ///
 /// # Panics
 /// If the parameter vector is too short for the network; see [`Actor::new`].

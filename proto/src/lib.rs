@@ -1,8 +1,8 @@
 //! The messages and services of package `tandem.v1`, and conversions between messages and the types of `tandem_core`.
 //!
 //! Conversions are total: a decoder refuses a malformed message with a [`DecodeError`] that names the field, and never
-//! fills in a default. Encoders borrow, decoders consume. Most lengths follow from a [task](tandem_core::TaskSpec), which
-//! messages do not repeat; decoders take it as an argument.
+//! fills in a default. Encoders borrow, decoders consume. Most lengths follow from a [task](tandem_core::TaskSpec),
+//! which messages do not repeat; decoders take it as an argument.
 //!
 //! ```
 //! use tandem_core::{Layout, StepQuery, Task};

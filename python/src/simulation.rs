@@ -75,7 +75,8 @@ impl Simulation {
         Ok((self.observation(py)?, self.info(py)?))
     }
 
-    /// Executes `action`, shape `[n_action]`.
+    /// Executes `action`, shape `[n_action]`, clamped to [−1, 1]. Returns observation, reward, terminated, truncated and
+    /// info; an episode never ends by itself, so the two flags are false.
     fn step<'py>(&mut self, py: Python<'py>, action: &Bound<'py, PyAny>) -> PyResult<Step<'py>> {
         self.step_by(py, action, Episode::step)
     }
@@ -148,7 +149,7 @@ impl Simulation {
         py.detach(|| episode.replay(seed, number, &actions)).map_err(|error| step_error(&error))
     }
 
-    /// Draws the scene: red, green and blue, shape `[height, width, 3]`.
+    /// Draws the scene, `width` times `height` pixels: red, green and blue, shape `[height, width, 3]`.
     fn render<'py>(
         &self,
         py: Python<'py>,
@@ -253,7 +254,8 @@ fn shape_error(action: &Bound<'_, PyAny>, n_action: usize) -> Option<PyErr> {
     has_shape.then(|| value_error(format!("the action has shape {shape}, expected ({n_action},)")))
 }
 
-/// Returns the sparse rewards, shape `[n]`, of `achieved` and `desired` goals, both of shape `[n, n_goal]`.
+/// Returns the sparse rewards, −1 or 0, shape `[n]`, of `achieved` and `desired` goals, metres, both of shape
+/// `[n, n_goal]`.
 #[pyfunction]
 pub(crate) fn compute_reward<'py>(
     py: Python<'py>,

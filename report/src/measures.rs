@@ -15,7 +15,7 @@ const MIN_EVALUATIONS: usize = 5;
 /// Tolerance of comparisons: the product of two shares may miss the share it equals by rounding.
 const ROUNDING: f64 = 1e-9;
 
-/// The paper's measures of a learning curve (Table 2), in paper epochs.
+/// The paper's measures of a learning curve (section 4.2, Table 2), in paper epochs.
 ///
 /// A curve that never leaves zero has only `max_success`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,7 +24,7 @@ pub struct LearningMeasures {
     pub inspired_epoch: Option<f64>,
     /// RT: number of epochs from 10 % to 90 % of the maximum.
     pub rising_epochs: Option<f64>,
-    /// MSR: the maximum success, in [0, 1].
+    /// MSR: the maximum success of an evaluation, in [0, 1].
     pub max_success: f64,
     /// ELR: 90 % of the maximum, divided by the number of epochs until it was reached.
     pub learning_rate: Option<f64>,

@@ -36,8 +36,8 @@ pub struct ReportFiles {
     pub plots: Vec<PathBuf>,
 }
 
-/// Writes a page with the tables, plots and film strips of `comparison` and `trials` to `path`, and each figure to a file
-/// in a directory beside it; see [`ReportFiles`]. It removes the figures of an earlier report there.
+/// Writes a page with the tables, plots and film strips of `comparison` and `trials` to `path`, and each figure to a
+/// file in a directory beside it; see [`ReportFiles`]. It removes the figures of an earlier report there.
 ///
 /// # Errors
 /// If a curve cannot be drawn, or a file cannot be written or removed.

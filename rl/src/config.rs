@@ -31,8 +31,8 @@ pub(crate) const EVALUATION_SLOT_EPISODES: usize = 8;
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`. A new run of `tandem
-    /// train` is named after its directory.
+    /// Name of the run, and of its account at the teacher: 1 to 100 letters, digits, `-`, `_` or `.`. A new run of
+    /// `tandem train` is named after its directory.
     pub name: String,
     /// A built-in task, by its full name: `push` and `pick-and-place` are those of the classic world. Or the name of
     /// `description`.
@@ -75,7 +75,7 @@ pub struct RunConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Behaviour {
-    /// The Polyak-averaged network (the paper, section 4.1).
+    /// The Polyak-averaged network (the paper, section 4.2).
     Target,
     /// The network that is being updated.
     Online,
@@ -91,7 +91,7 @@ pub struct AdviceConfig {
     /// Advising strategy and its threshold (the paper, section 3.2), or `init:teacher`: no advice, the student starts
     /// as a copy of the teacher for each arm.
     pub strategy: String,
-    /// Units of advice, at most 10^12 for the whole run (paper: 500,000).
+    /// Units of advice, at most 10^12 for the whole run (paper, section 4.1: 500,000).
     pub budget: u64,
     /// Whether the budget is that of the run (`run`) or of each of its slots (`slot`). The budgets of the slots are
     /// added up to one: slots differ in their seeds only and spend alike.
@@ -139,7 +139,8 @@ impl AdviceConfig {
         self.strategy.parse().ok()
     }
 
-    /// Returns the largest number of steps at the start of an episode on which the student asks; `None` means all.
+    /// Returns the largest number of control steps at the start of an episode on which the student asks; `None` means
+    /// all.
     #[must_use]
     pub fn horizon(&self) -> Option<u32> {
         match self.parsed_strategy() {
@@ -148,7 +149,8 @@ impl AdviceConfig {
         }
     }
 
-    /// Returns the disagreement of critics above which the student asks; `None` means that it asks without one.
+    /// Returns the standard deviation of the critics' values above which the student asks; `None` means that it asks on
+    /// every step.
     #[must_use]
     pub fn disagreement_threshold(&self) -> Option<f32> {
         match self.parsed_strategy() {
@@ -157,7 +159,7 @@ impl AdviceConfig {
         }
     }
 
-    /// Returns the cost to an arm of its own step before the teacher overrides it.
+    /// Returns the cost to an arm of its own step before the teacher overrides it: 1 with strategy `rlif:T`, else 0.
     #[must_use]
     pub fn intervention_cost(&self) -> f32 {
         match self.parsed_strategy() {
@@ -183,9 +185,9 @@ impl AdviceConfig {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RoundsConfig {
-    /// Slots per round, 1 to 4096, and at most 65,536 / `rollouts` (paper: 16, one per worker).
+    /// Slots per round, 1 to 4096, and at most 65,536 / `rollouts` (paper, section 4.2: 16, one per worker).
     pub slots: usize,
-    /// Episodes per slot, stepped in lock step, 1 to 64 (paper: 2).
+    /// Episodes per slot, stepped in lock step, 1 to 64 (paper, section 4.2: 2).
     pub rollouts: usize,
     /// 0: a round is played with the parameters of the previous round (paper). 1: a round is played while the previous
     /// one is being learned.
@@ -225,15 +227,16 @@ pub enum PolyakEvery {
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// Environment steps between two evaluations; without a value a fifth of `stop.max_env_steps`, at most the
-    /// recipe's.
+    /// Environment steps between two evaluations, rounded down to whole rounds but at least one; without a value a
+    /// fifth of `stop.max_env_steps`, at most the recipe's.
     pub every_env_steps: u64,
     /// Further evaluations before the first regular one, 0 to 100: of the initial policy, then evenly spaced. A run
     /// file that sets `evaluation.every_env_steps` has none unless it sets them, and a run that is so short that it is
     /// evaluated more often than the recipe says has one.
     #[serde(default)]
     pub early_points: u64,
-    /// Fixed goals per evaluation, 1 to 100,000 (paper: 240).
+    /// Fixed goals per evaluation, 1 to 100,000 (paper: not given; most success rates of its Table 2 are multiples of
+    /// 1/240).
     pub episodes: u64,
     /// Seed of the goals with which a run selects its best policy. Reports use another one.
     pub seed: u64,
@@ -376,14 +379,16 @@ impl RunConfig {
         (0..n_early).any(|point| early(point) == u128::from(round))
     }
 
-    /// Returns the cost of a contact in round `round`, from 0. It grows between a tenth and half of the run.
+    /// Returns the cost of a contact, in units of reward, in round `round`, from 0. It grows between a tenth and half
+    /// of the run.
     #[must_use]
     pub fn contact_cost(&self, round: u64) -> f32 {
         let growth = self.replay.contact_cost_growth - 1.0;
         self.replay.contact_cost * (1.0 + self.share_of_part(round, 0.1, 0.5) * growth)
     }
 
-    /// Returns the discount in round `round`, from 0. Its horizon grows between one quarter and three quarters of the run.
+    /// Returns the discount per control step in round `round`, from 0. Its horizon `1 / (1 - discount)` grows between
+    /// one quarter and three quarters of the run.
     #[must_use]
     pub fn discount(&self, round: u64) -> f32 {
         let share = self.share_of_part(round, 0.25, 0.75);

@@ -1,13 +1,14 @@
 //! One update of DDPG (Lillicrap et al. 2016) with a value per arm and behaviour cloning of advice.
 //!
-//! The order is that of section 2.1 of the paper: the critic's target from the target networks, the critic's loss, the
-//! actor's loss, a step of Adam for each, and Polyak averaging of the target networks. Both gradients are taken at the
-//! same parameters, so the critic's half and the actor's half of an update can run in parallel.
+//! It has the steps of section 2.2 of the paper, with the target networks of section 4.2: the critic's target and loss
+//! (equation 5), the actor's loss (equation 4), a step of Adam for each, and Polyak averaging of the target networks.
+//! Both gradients are taken at the same parameters, so the critic's half and the actor's half of an update can run in
+//! parallel.
 //!
-//! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks of
-//! rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks are
-//! tasks that any number of threads take one after the other. Which tasks there are depends on sizes only, and no number
-//! is summed across tasks, so the bits do not depend on the number of threads.
+//! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks
+//! of rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks
+//! are tasks that any number of threads take one after the other. Which tasks there are depends on sizes only, and no
+//! number is summed across tasks, so the bits do not depend on the number of threads.
 
 use std::ops::Range;
 
@@ -100,9 +101,10 @@ struct Sizes {
 /// Losses of an update, at the parameters before it: means over its batches.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpdateLosses {
-    /// Squared error of the critic: mean over the batch, sum over the heads.
+    /// Squared error of the critic (equation 5 of the paper): mean over the batch, sum over the heads.
     pub critic_loss: f64,
-    /// The actor's loss: negative value, action penalty and behaviour cloning.
+    /// The actor's loss: the negative value, summed over the heads (equation 4 of the paper), the action penalty and
+    /// behaviour cloning; mean over the batch.
     pub actor_loss: f64,
     /// Value of the actor's own actions: mean over the batch and the heads.
     pub mean_q: f64,
@@ -195,10 +197,10 @@ impl Ddpg {
     /// The gradients of the batches are summed.
     ///
     /// # Errors
-    /// When a loss or a parameter is no longer finite.
+    /// When a loss or a parameter is no longer finite. The networks are unusable then.
     ///
     /// # Panics
-    /// When the batch does not have the configured size and layout.
+    /// When the batch does not have [`DdpgConfig::transitions_per_update`] rows, or another layout.
     pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
         self.check_size(batch);
         let n_threads = self.scratch.len();
@@ -308,12 +310,12 @@ impl Ddpg {
         critic.adam.set_learning_rate(rate(config.critic_learning_rate));
     }
 
-    /// Sets the discount for the updates that follow.
+    /// Sets the discount per control step, in [0, 1), for the updates that follow.
     pub const fn set_discount(&mut self, discount: f32) {
         self.config.discount = discount;
     }
 
-    /// Sets the weight of behaviour cloning for the updates that follow.
+    /// Sets the weight of behaviour cloning, 0 or more, for the updates that follow.
     pub const fn set_bc_weight(&mut self, weight: f32) {
         self.config.bc_weight = weight;
     }
@@ -323,7 +325,7 @@ impl Ddpg {
         self.filters_advice = filters_advice;
     }
 
-    /// Sets how many threads of the rayon pool work on an update, 1 or more. The results are the same, bit for bit.
+    /// Sets how many threads of the rayon pool work on an update; 0 means 1. The results are the same, bit for bit.
     pub fn set_threads(&mut self, n_threads: usize) {
         let Self { actor, critic, row_blocks, scratch, .. } = self;
         let n_rows = row_blocks.iter().map(Range::len).max().unwrap_or(0);
@@ -346,7 +348,8 @@ struct Finite {
 pub struct Rewards {
     /// Rewards per step: 1, or one per arm.
     pub n_heads: usize,
-    /// The lowest possible reward; the highest is 0.
+    /// The lowest possible reward of a step; the highest is 0. The critic's targets are clipped to
+    /// `[lowest / (1 - discount), 0]`.
     pub lowest: f32,
 }
 

@@ -1,5 +1,5 @@
-//! The ensemble of critics of strategy `ts2c:T`, whose disagreement says where the student does not know the value of its
-//! action (after TS2C, Xue et al. 2023).
+//! The ensemble of critics of strategy `ts2c:T`, whose disagreement says where the student does not know the value of
+//! its action (after TS2C, Xue et al. 2023).
 //!
 //! The critics are small, differ in their initialisation, and learn the targets of the student's critic on the same
 //! batches. Where they have seen data they agree; elsewhere each extrapolates in its own way (Lakshminarayanan et al.
@@ -22,7 +22,7 @@ const N_HIDDEN_LAYERS: usize = 2;
 /// The first number of a critic in the stream of initialisations; actor and critic of the student have 0 and 1.
 const FIRST_NUMBER: u64 = 2;
 
-/// The critics and their optimisers.
+/// Three critics of two hidden layers with 64 units each, and their optimisers.
 #[derive(Debug, Clone)]
 pub struct CriticEnsemble {
     shape: MlpShape,
@@ -65,7 +65,8 @@ impl CriticEnsemble {
         }
     }
 
-    /// Makes one gradient step of every critic toward the targets of `batch`. Returns true if all parameters are finite.
+    /// Makes one gradient step of every critic toward the targets of `batch`. Returns true if all parameters are
+    /// finite.
     ///
     /// # Panics
     /// When the batch has another size.
@@ -119,7 +120,7 @@ impl CriticEnsemble {
     /// Restores the vectors returned by [`state`](Self::state), in its order, after `n_updates` updates.
     ///
     /// # Errors
-    /// Names the first vector that has another length. The ensemble is unusable then.
+    /// Describes the mismatch: another number of vectors, or the first one of another length. Nothing changes then.
     pub fn restore(&mut self, stored: &[Vec<f32>], n_updates: u64) -> Result<(), String> {
         let expected = self.shape.n_parameters();
         if stored.len() != 3 * self.members.len() {

@@ -94,22 +94,23 @@ impl Sampler {
         }
     }
 
-    /// Sets the cost of a contact for the batches that follow.
+    /// Sets the cost of a contact, in units of reward, 0 or more, for the batches that follow.
     pub const fn set_contact_cost(&mut self, cost: f32) {
         self.contact_cost = cost;
     }
 
-    /// Sets the cost of an intervention, for strategy `rlif:T` (RL via intervention feedback, Luo et al. 2023): an arm's
-    /// own step before the teacher overrides it.
+    /// Sets the cost of an intervention, for strategy `rlif:T` (RL via intervention feedback, Luo et al. 2023): an
+    /// arm's own step before the teacher overrides it.
     ///
-    /// The steps that the teacher decides keep their reward: the stored action is the executed one, the teacher's, which
-    /// a cost would teach the student to avoid. An arm whose goal is replaced in hindsight keeps its recomputed reward,
-    /// because the teacher's verdict is about the desired goal.
+    /// The steps that the teacher decides keep their reward: the stored action is the executed one, the teacher's,
+    /// which a cost would teach the student to avoid. An arm whose goal is replaced in hindsight keeps its recomputed
+    /// reward, because the teacher's verdict is about the desired goal.
     pub const fn set_intervention_cost(&mut self, cost: f32) {
         self.intervention_cost = cost;
     }
 
-    /// Fills every row of `batch` with a transition sampled from `buffer`.
+    /// Fills every row of `batch` with a transition sampled from `buffer`. Observations and goals are normalised with
+    /// `statistics`.
     ///
     /// # Panics
     /// When the buffer is empty or the batch has another layout.

@@ -1,11 +1,11 @@
 //! The horizon of strategy `jsrl:H` (Jump-Start RL, Uchendu et al. 2023): the number of steps, at the start of an
 //! advised episode, on which the teacher acts.
 //!
-//! It falls from H to 0 as the student's own success rises: `h = ⌈H · (1 − s / 0.7)⌉` for the success rate s of a window
-//! of training episodes without advice, and never rises again. (Uchendu et al. lower it by a fixed step whenever the
-//! success of teacher and student together is within a tolerance of the best; a student that does not improve then costs
-//! the full horizon for good.) These episodes explore and so succeed less often than evaluations: the horizon is 0 at a
-//! rate of 0.7 already. If all episodes are advised, all of them count.
+//! It falls from H to 0 as the student's own success rises: `h = ⌈H · (1 − s / 0.7)⌉` for the success rate s of a
+//! window of training episodes without advice, and never rises again. (Uchendu et al. lower it by a fixed step whenever
+//! the success of teacher and student together is within a tolerance of the best; a student that does not improve then
+//! costs the full horizon for good.) These episodes explore and so succeed less often than evaluations: the horizon is
+//! 0 at a rate of 0.7 already. If all episodes are advised, all of them count.
 //!
 //! Pure: the horizon of a round depends on the episodes of the rounds up to the one before the previous round. So it is
 //! known when the round is ordered, with `rounds.lag` 0 and 1, and again when a run resumes.
@@ -31,14 +31,14 @@ pub struct JumpStart {
 }
 
 impl JumpStart {
-    /// Creates the state before the first round, with horizon `max_horizon`.
+    /// Creates the state before the first round, with horizon `max_horizon`, control steps.
     #[must_use]
     pub const fn new(max_horizon: u32) -> Self {
         Self { max_horizon, present: max_horizon, next: max_horizon, n_episodes: 0, n_succeeded: 0 }
     }
 
-    /// Returns the horizon of a round: the one to be learned next (0), or the one after it (1). Later rounds are not
-    /// decided yet, and have that of round 1.
+    /// Returns the horizon of a round, control steps: the one to be learned next (0), or the one after it (1). Later
+    /// rounds are not decided yet, and have that of round 1.
     #[must_use]
     pub const fn horizon(&self, n_rounds_ahead: u64) -> u32 {
         if n_rounds_ahead == 0 { self.present } else { self.next }
@@ -56,7 +56,8 @@ impl JumpStart {
         }
     }
 
-    /// Returns the state without `H`, as a checkpoint stores it.
+    /// Returns the state without `H`, as a checkpoint stores it: the horizons of the present and the next round, and
+    /// the episodes of the window and those of them that succeeded.
     #[must_use]
     pub const fn state(&self) -> [u32; 4] {
         [self.present, self.next, self.n_episodes, self.n_succeeded]

@@ -7,6 +7,9 @@ use tandem_core::{ArmIndex, Contacts, Episode, TaskSpec};
 
 /// The replay buffer: whole episodes in flat arrays, episode `e` at `e * stride` of each. A full buffer overwrites the
 /// oldest episode.
+///
+/// # Panics
+/// Methods panic if there is no such episode, step or arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayBuffer {
     layout: TaskSpec,

@@ -37,7 +37,7 @@ pub struct Counters {
     pub episodes: u64,
     /// Updates of the networks.
     pub updates: u64,
-    /// Units of the advice budget charged for training episodes.
+    /// Units of the advice budget charged for training episodes: [`Trainer::correct_advice_spent`] sets them.
     pub advice_spent: u64,
     /// Training steps on which the teacher was asked. The digest does not cover them.
     pub advice_queries: u64,
@@ -71,9 +71,9 @@ pub struct Trainer {
     pub replay: ReplayBuffer,
     /// Networks, target networks and optimisers.
     pub ddpg: Ddpg,
-    /// Running mean and deviation of observations.
+    /// Running mean and standard deviation of observations.
     pub observation_normalizer: Normalizer,
-    /// Running mean and deviation of goals.
+    /// Running mean and standard deviation of goals, desired and hindsight.
     pub goal_normalizer: Normalizer,
     /// The horizon of strategy `jsrl:H`; `None` with other strategies.
     pub jump_start: Option<JumpStart>,
@@ -185,6 +185,9 @@ impl Trainer {
     }
 
     /// Adds a round's episodes, in episode order, to the replay buffer, the normalisers and the counters.
+    ///
+    /// # Panics
+    /// When an episode has another layout.
     pub fn ingest(&mut self, episodes: &[Episode]) {
         for episode in episodes {
             self.replay.push(episode);
@@ -236,7 +239,10 @@ impl Trainer {
     /// Makes a round's updates. Calls `on_update` with their number after each.
     ///
     /// # Errors
-    /// When a loss or a parameter is no longer finite.
+    /// When a loss or a parameter is no longer finite. The state is unusable then.
+    ///
+    /// # Panics
+    /// When no episode was [ingested](Self::ingest) yet.
     pub fn learn(&mut self, mut on_update: impl FnMut(u64)) -> Result<RoundStats, DdpgError> {
         let mut rng = episode_rng(self.config.seed, self.counters.round, Stream::Replay);
         let statistics = Statistics {

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use tandem_core::{Task, World, WorldSettings};
 
-/// Physics parameters of a world.
+/// Physics parameters of a world. The default is the world in which policies are evaluated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldConfig {
@@ -28,8 +28,8 @@ pub struct WorldConfig {
     pub pick_and_place: Friction,
     /// Friction in the task to carry a bar.
     pub carry_bar: Friction,
-    /// Coulomb friction coefficient of the pads in the shared world's push task, in [0, 2]. Their tips have the coefficient
-    /// that `push` gives to pads.
+    /// Coulomb friction coefficient of the pads in the shared world's push task, in [0, 2]. Their tips have the
+    /// coefficient that `push` gives to pads.
     pub rubber_pads: f32,
 }
 

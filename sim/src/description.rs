@@ -86,7 +86,7 @@ pub struct ShapeDescription {
     pub part: Part,
     /// Index of the arm that it belongs to.
     pub arm: usize,
-    /// Mass, kilograms.
+    /// Mass, kilograms; 0 for a fixed shape.
     pub mass_kg: f32,
     /// Shape and size.
     #[serde(flatten)]
@@ -156,8 +156,8 @@ pub struct HandControl {
     pub workspace_low_m: [f32; 3],
     /// Upper corner of this workspace, arm frame, metres.
     pub workspace_high_m: [f32; 3],
-    /// The part of this workspace that the arm reaches; all of it if there is none. Targets outside are moved along their
-    /// radius.
+    /// The part of this workspace that the arm reaches; all of it if there is none. Targets outside are moved along
+    /// their radius.
     pub reach: Option<&'static Reach>,
     /// Gain from the palm's distance to its target to its velocity, 1/s.
     pub approach_gain_per_s: f32,

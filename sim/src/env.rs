@@ -18,7 +18,8 @@ use crate::world::World;
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
 
-/// One of the environments: push or pick and place, with one arm or two, in either world, or two arms that carry a bar.
+/// One of the environments: push or pick and place, with one arm or two, in the classic or the shared world, or two
+/// arms that carry a bar in the slow world.
 ///
 /// An episode is a function of the random numbers passed to [`reset`](Self::reset) and of the actions, bit for bit. It
 /// depends neither on earlier episodes nor on the thread.
@@ -77,10 +78,10 @@ impl Env {
     /// Starts an episode with random positions of hands and objects and with random goals.
     ///
     /// All bodies are at rest. An object touches nothing but the table or, in a grasped start, the fingers that hold
-    /// it. If `randomization` of `settings` is not 0, the properties of the episode's world are drawn first: size and mass of
-    /// the objects, friction, a delay of up to 40 ms before an action takes effect, errors of observed positions and, in the
-    /// shared world, the margin of contacts. `substeps` has no effect: the resolution of the physics is that of the
-    /// [`WorldConfig`]. `settings` must be [checked](WorldSettings::check).
+    /// it. If `randomization` of `settings` is not 0, the properties of the episode's world are drawn first: size and
+    /// mass of the objects, friction, a delay of up to 40 ms before an action takes effect, errors of observed
+    /// positions and, in the shared world, the margin of contacts. `substeps` has no effect: the resolution of the
+    /// physics is that of the [`WorldConfig`]. `settings` must be [checked](WorldSettings::check).
     pub fn reset(&mut self, rng: &mut ChaCha8Rng, settings: WorldSettings) {
         self.world = self.prototype.clone();
         self.n_steps = 0;
@@ -110,15 +111,18 @@ impl Env {
     /// | 0–2 | position of the end effector | m |
     /// | 3–5 | position of the object | m |
     /// | 6–8 | position of the object relative to the end effector | m |
-    /// | 9–11 | openings of the three fingers | m |
-    /// | 12–15 | orientation of the object, quaternion (x, y, z, w) with w ≥ 0 | – |
+    /// | 9–11 | openings of the fingers | m |
+    /// | 12–15 | orientation of the object in the arm's frame, quaternion (x, y, z, w) with w ≥ 0 | – |
     /// | 16–18 | velocity of the object relative to the end effector | m per control step |
     /// | 19–21 | angular velocity of the object | rad per control step |
     /// | 22–24 | velocity of the end effector | m per control step |
     /// | 25–27 | rates of the openings | m per control step |
     ///
-    /// In episodes with `randomization`, numbers 3–8 have errors of a few millimetres, drawn per episode and per step. What
-    /// is computed from them, such as the achieved goal, has them too.
+    /// A gripper of the shared world has two fingers: numbers 9 and 10, and 25 and 26, are those of the same one.
+    /// Openings are 0 in tasks without grasping, whose gripper is locked.
+    ///
+    /// In episodes with `randomization`, numbers 3–8 have errors of a few millimetres, drawn per episode and per step.
+    /// What is computed from them, such as the achieved goal, has them too.
     ///
     /// # Panics
     /// If `observation` does not have length `n_observation`.
@@ -130,13 +134,15 @@ impl Env {
         }
     }
 
-    /// Returns the goal positions of the objects, in arm order, each in the arm's frame, metres, shape `[n_goal]`.
+    /// Returns the goal positions of the objects, in arm order, each in the arm's frame, metres, shape `[n_goal]`;
+    /// zeros before the first reset.
     #[must_use]
     pub fn goal(&self) -> &[f32] {
         &self.goal
     }
 
-    /// Returns the box that contains the goals of all episodes, in the frame of an arm: the range along each axis, metres.
+    /// Returns the box that contains the goals of all episodes, in the frame of an arm: the range along each axis,
+    /// metres.
     #[must_use]
     pub fn goal_area(&self) -> [[f32; 2]; 3] {
         goal_area(self.layout, self.object_half_m)
@@ -155,19 +161,21 @@ impl Env {
         self.goal[self.layout.goal_of(arm)].copy_from_slice(&in_area);
     }
 
-    /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the arms
-    /// during it.
+    /// Executes `action` for one [control step](tandem_core::World::control_step_s) and returns the contacts of the
+    /// arms during it.
     ///
     /// `action` has shape `[n_action]`, in arm frames, and is clamped to [−1, 1]. Each arm's part is a displacement of
-    /// the end effector along x, y and z in units of 5 cm and, in tasks of grasping, the gripper's input: positive values
-    /// open the gripper, −1 closes it and holds.
+    /// the end effector along x, y and z in units of 5 cm and, in tasks of grasping, the gripper's input: positive
+    /// values open the gripper, −1 closes it and holds.
     ///
     /// Two arms are in contact if palms, wrists or fingers press on each other in any physics step, or if the gap
-    /// between a link and a part of the other arm falls below zero. In episodes of the shared world with `randomization`, a
-    /// gap below a margin of up to 2 cm, drawn with the episode, counts as a contact, between hands too. An arm is in contact with the table if palm, wrist
-    /// or fingers press on it; the links stay high above it. The workspace ends 2 mm above the table, 16 mm in the shared
-    /// world, so an arm touches the table only if it is pushed down. Only the shared world says which arm it was. In the shared world an arm is also in contact with the table while its hand presses
-    /// an object onto it with more than 10 N: arms whose torques are supervised stop there.
+    /// between a link and a part of the other arm falls below zero. In episodes of the shared world with
+    /// `randomization`, a gap below a margin of up to 2 cm, drawn with the episode, counts as a contact, between hands
+    /// too. An arm is in contact with the table if palm, wrist or fingers press on it; the links stay high above it.
+    /// The workspace ends 2 mm above the table, 16 mm in the shared world, so an arm touches the table only if it is
+    /// pushed down. Only the shared world says which arm it was. In the shared world an arm is also in contact with the
+    /// table while its hand presses an object onto it with more than 10 N: arms whose torques are supervised stop
+    /// there.
     ///
     /// # Errors
     /// Returns an error if `action` has the wrong length or contains a number that is not finite; the state is then

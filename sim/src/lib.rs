@@ -1,9 +1,8 @@
 //! The simulated environments: push and pick and place with one arm or two, and two arms that carry a bar.
 //!
-//! An [`Env`] starts episodes, writes observations and executes actions. All environments share one
-//! implementation; a [`Layout`](tandem_core::Layout) selects the task and the number of arms. The crate knows nothing
-//! of policies, advice or rewards: `tandem_policy` chooses actions, and [`tandem_core::reward`] computes rewards from
-//! observations.
+//! An [`Env`] starts episodes, writes observations and executes actions. All environments share one implementation; a
+//! [`Layout`](tandem_core::Layout) selects the task and the number of arms. The crate knows nothing of policies, advice
+//! or rewards: `tandem_policy` chooses actions, and [`tandem_core::reward`] computes rewards from observations.
 //!
 //! # An episode
 //!
@@ -86,10 +85,9 @@
 //! # Implementation in reading order
 //!
 //! `env` (the interface), `world` and `physics` (a rapier world for bodies of centimetres), `hand` (palm and fingers,
-//! moved by forces), `arm` and `kinematics` (the joints of a Jaco follow the hand by inverse kinematics), `mico` (a Mico's
-//! posture, in closed form), `capsule` and
-//! `link_avoidance` (a velocity damper between the links of two arms), `frame`, `observation`, `start` (initial states),
-//! `scene` and `description` (the world as data).
+//! moved by forces), `arm` and `kinematics` (the joints of a Jaco follow the hand by inverse kinematics), `mico` (a
+//! Mico's posture, in closed form), `capsule` and `link_avoidance` (a velocity damper between the links of two arms),
+//! `frame`, `observation`, `start` (initial states), `scene` and `description` (the world as data).
 #![warn(missing_docs)]
 
 mod arm;

@@ -49,8 +49,8 @@ pub(crate) struct JointPoints {
 }
 
 /// The lengths of a Mico, whose upper arm and forearm lie in the vertical plane through the base's axis and the end
-/// effector, with the elbow up. The hand continues the forearm, and its fingers close as nearly along y of the arm's frame
-/// as its tilt permits.
+/// effector, with the elbow up. The hand continues the forearm, and its fingers close as nearly along y of the arm's
+/// frame as its tilt permits.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MicoKinematics {
     /// Position of the shoulder, arm frame, metres.

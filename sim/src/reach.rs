@@ -37,7 +37,7 @@ impl Reach {
     };
 
     /// Returns the smallest and the largest radius from the base's axis at which the end effector can be `height_m`
-    /// above the table, metres. Beyond the table's heights they are those of the nearest one.
+    /// above the table, metres. Below 3.1 cm and above 33 cm they are those of the nearest one of these heights.
     #[must_use]
     pub fn radii_m(&self, height_m: f32) -> [f32; 2] {
         let [lowest, .., highest] = self.rings;
@@ -67,7 +67,7 @@ impl Reach {
         Vector::new(self.axis_x_m, 0.0, height_m)
     }
 
-    /// Moves a point (arm frame, metres) along its radius to the nearest one in reach.
+    /// Moves a point (arm frame, metres) along its radius, at its height, to the nearest one in reach.
     #[must_use]
     pub fn clamp(&self, point: Vector) -> Vector {
         let radius_m = self.radius_m(point.to_array());

@@ -20,8 +20,8 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace_with(path, |mut file| file.write_all(bytes))
 }
 
-/// Replaces the file that `path` names with `bytes`, or writes them to it if it is no regular file, as `/dev/stdout`. If
-/// `path` is a link, the file that it leads to is replaced.
+/// Replaces the file that `path` names with `bytes`, or writes them to it if it is no regular file, as `/dev/stdout`.
+/// If `path` is a link, the file that it leads to is replaced.
 ///
 /// # Errors
 /// As [`replace_with`].

@@ -1,7 +1,7 @@
 //! Locks on directories.
 //!
-//! The lock is on the directory itself, so there is no lock file that a cleanup could remove. The system releases a lock
-//! however its process ends.
+//! The lock is on the directory itself, so there is no lock file that a cleanup could remove. The system releases a
+//! lock however its process ends.
 
 use std::fs::{File, TryLockError};
 use std::io::{self, ErrorKind};

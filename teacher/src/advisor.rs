@@ -96,8 +96,8 @@ impl Advisor {
         })
     }
 
-    /// Makes the service end with [`Error::LedgerNeedsRestart`] when only another process can charge the ledger's accounts.
-    /// Otherwise it continues to refuse charges.
+    /// Makes the service end with [`Error::LedgerNeedsRestart`] when only another process can charge the ledger's
+    /// accounts. Otherwise it continues to refuse charges.
     #[must_use]
     pub fn ending_for_restart(self) -> Self {
         Self { ends_for_restart: true, ..self }

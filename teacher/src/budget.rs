@@ -23,7 +23,7 @@ pub const MAX_BUDGET: u64 = 1_000_000_000_000;
 /// The budget and the strategy of an account. They never change.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AccountTerms {
-    /// Units of advice, at most [`MAX_BUDGET`].
+    /// Units of advice, at most [`MAX_BUDGET`]: the paper's `n_b`.
     pub budget: u64,
     /// Decides which steps are worth a unit.
     pub strategy: Strategy,

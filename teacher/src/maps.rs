@@ -1,7 +1,7 @@
 //! The maps between a student's vectors and those of a teacher for one arm (equations 7 to 9 of the paper), as data.
 //!
-//! A request contains the parts of a student's arms, concatenated in arm order. The student's own vectors may have another
-//! order.
+//! A request contains the parts of a student's arms, concatenated in arm order. The student's own vectors may have
+//! another order.
 
 use std::ops::Range;
 
@@ -45,13 +45,14 @@ impl Maps {
         &self.arms
     }
 
-    /// Returns the maps of the arms of a student whose actions have `n_action` numbers, in arm order.
+    /// Returns the maps of the arms of a student whose actions have `n_action` numbers, in arm order: as many as fit.
     pub fn of_student(&self, n_action: usize) -> impl ExactSizeIterator<Item = &ArmMap> {
         let n_arms = self.arms.partition_point(|arm| arm.action.end <= n_action);
         self.arms[..n_arms].iter()
     }
 
-    /// Composes a student's action, shape `[n_action]`, from the actions of its arms: `f^a` (equation 8).
+    /// Composes a student's action, shape `[n_action]`, from the actions of its arms, each of shape `[action_per_arm]`:
+    /// `f^a` (equation 8). Arms without an action get zeros.
     ///
     /// # Panics
     /// When the length of an arm's action differs from that of its range.
@@ -70,7 +71,11 @@ impl Maps {
 }
 
 impl ArmMap {
-    /// Returns the arm's observation and goal: `f_i^sg` (equation 7).
+    /// Returns the arm's parts of `observation`, shape `[n_observation]`, and `goal`, shape `[n_goal]`: `f_i^sg`
+    /// (equation 7).
+    ///
+    /// # Panics
+    /// When a vector is too short for the arm's range.
     #[must_use]
     pub fn teacher_state<'a>(
         &self,
@@ -80,7 +85,10 @@ impl ArmMap {
         (&observation[self.observation.clone()], &goal[self.goal.clone()])
     }
 
-    /// Returns the arm's action: `h_i^a` (equation 9).
+    /// Returns the arm's part of `action`, shape `[n_action]`: `h_i^a` (equation 9).
+    ///
+    /// # Panics
+    /// When the action is too short for the arm's range.
     #[must_use]
     pub fn arm_action<'a>(&self, action: &'a [f32]) -> &'a [f32] {
         &action[self.action.clone()]

@@ -16,12 +16,13 @@ pub use onnx::OnnxPolicy;
 /// Extension of the files that hold an ONNX model.
 const ONNX_EXTENSION: &str = "onnx";
 
-/// A policy for one arm with an actor and a critic. Rows are states of one arm.
+/// A policy for one arm with an actor and, unless it has no values, a critic. Rows are states of one arm. Callers pass
+/// vectors whose lengths fit the [task](Self::layout).
 pub trait TeacherPolicy: Send {
     /// Returns the task, of one arm.
     fn layout(&self) -> TaskSpec;
 
-    /// Returns the text that identifies the policy: the SHA-256 of the parameters, hexadecimal.
+    /// Returns the text that identifies the policy: the SHA-256, hexadecimal, of its parameters or files.
     fn digest(&self) -> &str;
 
     /// Returns true if the policy values actions. If not, the teacher refuses strategies that compare values, and does
@@ -30,8 +31,8 @@ pub trait TeacherPolicy: Send {
         true
     }
 
-    /// Writes the actions of `π_tr`, shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`, and
-    /// `goals`, shape `[n, n_goal]`.
+    /// Writes the actions of `π_tr`, in [−1, 1], shape `[n, n_action]`, for `observations`, shape `[n, n_observation]`,
+    /// and `goals`, shape `[n, n_goal]`.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]);
 
     /// Writes the values of `Q_tr`, shape `[n]`, of `actions`, shape `[n, n_action]`, in the same states.
@@ -161,7 +162,7 @@ impl OneArmPolicy {
     /// Prepares `policy` for inference.
     ///
     /// # Errors
-    /// When the policy is not for one arm, or its critic has several values.
+    /// When the policy is not for one arm or is invalid, or its critic has several values.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
         Self::of(policy, "this one".to_owned())
     }

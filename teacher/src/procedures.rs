@@ -2,8 +2,8 @@
 //! one arm.
 //!
 //! [`crate::advisor`] has the loop over the arms and `a = f^a(a_1, …, a_n)`; [`crate::budget`] has the test `n_b > 0`
-//! and the decrement. The procedures judge the action that the student is about to execute, exploration included, or its
-//! policy's action, as the run's `advice.judged_action` says.
+//! and the decrement. The procedures judge the action that the student is about to execute, exploration included, or
+//! its policy's action, as the run's `advice.judged_action` says.
 
 use tandem_core::ArmAdvice;
 use tandem_core::reward::distance;
@@ -11,14 +11,14 @@ use tandem_core::reward::distance;
 /// A rule that selects the arms to override.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Procedure {
-    /// Procedure 1.
+    /// Procedure 1: on every step.
     EarlyAdvising,
-    /// Procedure 2.
+    /// Procedure 2: where the student's action loses more of the teacher's value than a threshold.
     MistakeCorrectingQ {
-        /// `t_I`.
+        /// `t_I`, a difference of values (equation 10), 0 or more.
         threshold: f32,
     },
-    /// Procedure 3.
+    /// Procedure 3: where the student's action is farther from the teacher's than a radius.
     MistakeCorrectingAction(ActionFilter),
 }
 
@@ -27,12 +27,12 @@ pub enum Procedure {
 pub enum ActionFilter {
     /// `t_a = α`.
     McAct {
-        /// `α`, a Euclidean distance of actions.
+        /// `α`, a Euclidean distance between two actions of one arm, 0 or more.
         alpha: f32,
     },
     /// `t_a = α · ‖π_tr(ŝ)‖₂`.
     McActAbs {
-        /// `α`, a multiple of the length of the teacher's action.
+        /// `α`, a multiple of the length of the teacher's action, 0 or more.
         alpha: f32,
     },
 }
@@ -90,7 +90,10 @@ pub fn mistake_correcting_action(distance: f32, radius: f32) -> bool {
 
 /// Scores the student's action on one arm of one step, with nothing overridden.
 ///
-/// Both actions have shape `[action_per_arm]`; the values are those of the teacher's critic.
+/// Both actions have shape `[action_per_arm]`; the values are those of the teacher's critic (equation 10).
+///
+/// # Panics
+/// When the actions differ in length.
 #[must_use]
 pub fn score_arm(
     teacher_action: &[f32],

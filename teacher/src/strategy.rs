@@ -15,7 +15,7 @@ pub enum BudgetHalf {
 }
 
 /// Returns the procedure of `strategy` for step `step` of an episode, from 0, whose unit would come from `half` of the
-/// budget; `None` if the teacher does not act.
+/// budget; `None` if the teacher does not act. The half matters to EAMC only (section 4.2 of the paper).
 #[must_use]
 pub fn procedure(strategy: Strategy, half: BudgetHalf, step: u32) -> Option<Procedure> {
     match (strategy, half) {

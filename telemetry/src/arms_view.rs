@@ -5,7 +5,8 @@ use tandem_core::scene::Scene;
 
 use crate::trial_log::LogLevel;
 
-/// The state of the arms after a tick of their bridge. Positions are in the world frame, metres; lists are in arm order.
+/// The state of the arms after a tick of their bridge. Positions are in the world frame, metres; lists are in arm
+/// order.
 ///
 /// It is serialized to JSON without the scene.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]

@@ -44,8 +44,8 @@ pub struct LoggedTransition {
     pub contacts: Contacts,
     /// Advice of the teacher in arm order; empty if it was not asked.
     pub advice: Vec<ArmAdvice>,
-    /// Units of the advice budget left when the teacher answered; `None` if it was not asked or the log is of an earlier
-    /// version.
+    /// Units of the advice budget left when the teacher answered; `None` if it was not asked or the log is of an
+    /// earlier version.
     pub budget_left: Option<u64>,
 }
 

@@ -4,6 +4,14 @@
 //! Foxglove opens the logs; `tandem replay` simulates recorded episodes again. The crate defines the layout of its
 //! files, and does not depend on what writes or reads them. It reads no clock: the times of an episode are simulated,
 //! and those of a run are arguments.
+//!
+//! | kind | written by | read by |
+//! |---|---|---|
+//! | logs of episodes, `*.mcap` | [`EpisodeRecorder`] | [`read_episode`]; [`recover`] after a crash |
+//! | logs of trials and of motions, `*.mcap` | [`TrialRecorder`], [`MotionJournal`] | Foxglove |
+//! | metrics of a run, `metrics.jsonl` | [`MetricsLog`] | [`MetricsLog::read_all`] |
+//! | results of trials, `trials.jsonl` | [`TrialsLog`] | [`read_trials`] |
+//! | events in the program's log | the types in [`events`] | [`logging`] sets it up |
 #![warn(missing_docs)]
 
 mod arms_messages;

@@ -2,8 +2,8 @@
 //!
 //! Episodes are put one after the other on one timeline, with a pause between them, and the stamps within messages are
 //! shifted with them. [`Replay`] plays a fixed set of logs, which a viewer can pause and seek; [`Follower`] plays each
-//! log of a directory once it is complete. [`LiveArms`] shows the current state of a bridge's arms. A viewer that cannot
-//! keep up loses messages and delays no other viewer.
+//! log of a directory once it is complete. [`LiveArms`] shows the current state of a bridge's arms. A viewer that
+//! cannot keep up loses messages and delays no other viewer.
 
 mod arms;
 mod channels;

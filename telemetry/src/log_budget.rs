@@ -11,7 +11,8 @@ const KEPT_EIGHTHS: u64 = 7;
 /// Number of processes that can write to one directory at once without exceeding the limit by more than a log each.
 const MAX_WRITERS: u64 = 16;
 
-/// Keeps the logs of episodes and motions in a directory below a size by deleting the oldest ones.
+/// Keeps the logs of episodes and motions in a directory below a size by deleting the oldest ones, until seven eighths
+/// of it are left.
 ///
 /// Logs of training episodes are deleted first, those of evaluations only when no others are left; within a kind, the
 /// lowest parameter version and then the lowest episode number is the oldest, and for motions the date and the number.

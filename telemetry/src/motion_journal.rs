@@ -22,9 +22,9 @@ const MAX_RECENT: usize = 1024;
 
 /// Writes a log for each motion, and for each fault that stops arms without a motion.
 ///
-/// Logs are named `motion-DATE-NUMBER.mcap` and `stop-DATE-NUMBER.mcap`, with the date and time in UTC and a number that
-/// counts the logs of this journal. If a log cannot be written, the journal logs one warning, leaves the incomplete file
-/// and tries again after ten seconds, also in the middle of a motion.
+/// Logs are named `motion-DATE-NUMBER.mcap` and `stop-DATE-NUMBER.mcap`, with the date and time in UTC and a number
+/// that counts the logs of this journal. If a log cannot be written, the journal logs one warning, leaves the
+/// incomplete file and tries again after ten seconds, also in the middle of a motion.
 pub struct MotionJournal {
     directory: PathBuf,
     budget: LogBudget,
@@ -51,8 +51,8 @@ struct OpenLog {
 }
 
 impl MotionJournal {
-    /// Creates `directory` unless it exists, and keeps its logs below `budget_bytes` from now on. `bridge` is metadata of
-    /// every log.
+    /// Creates `directory` unless it exists, and keeps its logs below `budget_bytes` from now on. `bridge` is metadata
+    /// of every log.
     ///
     /// # Errors
     /// If the directory cannot be created, read or written to, or old logs cannot be deleted.

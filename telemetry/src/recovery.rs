@@ -32,8 +32,8 @@ pub struct RecoveredCounts {
 /// `source` is not modified. `destination` is created only when it is complete, so an error leaves no incomplete file.
 ///
 /// # Errors
-/// If `source` cannot be read, does not start like an MCAP file or is damaged before its first message, or if `destination`
-/// cannot be written.
+/// If `source` cannot be read, does not start like an MCAP file or is damaged before its first message, or if
+/// `destination` cannot be written.
 pub fn recover(source: &Path, destination: &Path) -> Result<RecoveredCounts, Error> {
     let bytes = regular_file::read(source).map_err(Error::io("read", source))?;
     if !bytes.starts_with(mcap::MAGIC) {

@@ -42,7 +42,7 @@ pub struct TrialRow {
     pub n_steps: u64,
     /// Number of steps that the check shortened or refused.
     pub n_shortened: u64,
-    /// Smallest gap between the arms, metres; `None` with one arm.
+    /// Smallest gap between the arms, metres, negative if they overlapped; `None` with one arm.
     pub arms_gap_m: Option<f64>,
     /// Smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,

@@ -60,12 +60,13 @@ pub enum SeriesError {
 }
 
 impl Series<'_> {
-    /// Runs trials `0..n_trials` on all threads of the pool, which begin them in order. Calls `done` after each trial, on
-    /// the trial's thread, with the trial's report and its row without a log. Returns the rows by number.
+    /// Runs trials `0..n_trials` on all threads of the pool, which begin them in order. Calls `done` after each trial,
+    /// on the trial's thread, with the trial's report and its row without a log. Returns the rows by number.
     ///
     /// # Errors
     /// Returns the error of a trial or of `done`; if there are several, that of the first trial. No other trial begins
-    /// then. Those that have begun are completed, so `done` has been called for every trial before the first that failed.
+    /// then. Those that have begun are completed, so `done` has been called for every trial before the first that
+    /// failed.
     pub fn run<E: From<SeriesError> + Send>(
         &self,
         n_trials: u64,

@@ -5,9 +5,9 @@
 //! the training world becomes one motion, which is planned, checked and executed without observing the objects. Unlike
 //! the paper, it rehearses several episodes and executes the most robust one. [`TrialMode::ClosedLoop`] queries the
 //! policy before every step with the measurements of cameras and encoders; each step is planned and checked as a
-//! separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was computed by a closed loop on
-//! a copy of the pair. All modes use the same executor and envelope.
-//! [`outcome`] then evaluates the final positions of the objects.
+//! separate motion, from rest to rest. [`TrialMode::Twin`] is an open loop whose motion was computed by a closed loop
+//! on a copy of the pair. All modes use the same executor and envelope. [`outcome`] then evaluates the final positions
+//! of the objects.
 //!
 //! [`mapping`] relates the policy's world to the table.
 
@@ -87,14 +87,15 @@ pub struct TrialConfig {
     pub layout: Layout,
     /// The way in which the policy is used.
     pub mode: TrialMode,
-    /// The size and mass of the blocks. Their positions are drawn.
+    /// The size and mass of the blocks. Their positions and rotations are drawn.
     pub block: Block,
-    /// Half the edge of the blocks that the policy was trained with, metres: [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M),
-    /// or that of `block` if their sizes varied. The policy perceives blocks and openings as those of such a block.
+    /// Half the edge of the blocks that the policy was trained with, metres:
+    /// [`TRAINED_HALF_M`](mapping::TRAINED_HALF_M), or that of `block` if their sizes varied. The policy perceives
+    /// blocks and openings as those of such a block.
     pub trained_half_m: f64,
-    /// The largest number of rehearsals of an open loop in the training world, at least 1. If it is greater than 1 and none
-    /// is robust, as many may follow in the closed loop on copies of the pair. The most robust one is executed. Arms that
-    /// share an object rehearse once.
+    /// The largest number of rehearsals of an open loop in the training world, at least 1. If it is greater than 1 and
+    /// none is robust, as many may follow in the closed loop on copies of the pair. The most robust one is executed.
+    /// Arms that share an object rehearse once.
     pub n_rehearsals: u32,
     /// The seed of starts, goals, latencies and noise.
     pub seed: u64,
@@ -129,7 +130,7 @@ pub struct TrialReport {
     pub n_shortened: usize,
     /// All contacts of the arms.
     pub touched: Contacts,
-    /// The smallest gap between the arms, metres.
+    /// The smallest gap between the arms, metres: negative if their capsules overlapped, infinite with one arm.
     pub arms_gap_m: f64,
     /// The smallest gap between an arm and the table, metres.
     pub table_gap_m: f64,

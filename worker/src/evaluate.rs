@@ -54,6 +54,7 @@ impl<A: Act> Act for ComposedTeachers<A> {
 }
 
 /// Plays the episodes with these numbers, and returns them in order. `seed` determines their starts and goals.
+/// `layout` has one or two arms and is the actor's.
 ///
 /// Each of `n_threads` threads has a world of its own. The result does not depend on their number.
 ///

@@ -1,7 +1,8 @@
-//! Exploration in training episodes: Gaussian noise on every action, and random actions that are held for several steps.
+//! Exploration in training episodes: Gaussian noise on every action, and random actions that are held for several
+//! steps.
 //!
-//! A random action of one step hardly moves a hand. Held for several steps, it carries the hand, and objects with it, to
-//! new places.
+//! A random action of one step hardly moves a hand. Held for several steps, it carries the hand, and objects with it,
+//! to new places.
 
 use rand_chacha::ChaCha8Rng;
 use tandem_core::rng::{bernoulli, standard_normal, uniform};
@@ -57,13 +58,19 @@ impl Explorer {
         Self::new(layout, Exploration { random_action_prob: 1.0, ..settings }, rng)
     }
 
-    /// Turns the policy's action into the action to execute, shape `[n_action]`, in [-1, 1].
+    /// Turns the policy's action for the next step into the action to execute, shape `[n_action]`, in [-1, 1].
+    ///
+    /// # Panics
+    /// If the action is too short.
     pub fn explore(&mut self, action: &mut [f32]) {
         self.explore_holding(action, |_arm| false);
     }
 
     /// As [`explore`](Self::explore), where `holds` tells which arms hold their objects: no random action opens their
     /// grippers, because one such step drops an object.
+    ///
+    /// # Panics
+    /// If the action is too short.
     pub fn explore_holding(&mut self, action: &mut [f32], holds: impl Fn(ArmIndex) -> bool) {
         let mut joint = None;
         for arm in self.layout.arms() {

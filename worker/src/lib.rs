@@ -3,8 +3,8 @@
 //! A worker knows neither how learning works nor what advice costs. It waits for a peer that is away and repeats its
 //! calls, so no step goes unadvised and no episode is lost because a peer was slow: results do not depend on timing.
 //!
-//! Start at [`rollout`], the life of an episode. It uses the simulator, the policy and the teacher through [`ports`] and
-//! cannot distinguish a network from a test. [`run()`] connects it to the learner and the teacher.
+//! Start at [`rollout`], the life of an episode. It uses the simulator, the policy and the teacher through [`ports`]
+//! and cannot distinguish a network from a test. [`run()`] connects it to the learner and the teacher.
 #![warn(missing_docs)]
 
 mod config;

@@ -10,11 +10,12 @@ use crate::ports::Act;
 /// effect; the episode that is recorded and judged contains the true state and the executed actions.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Perturbation {
-    /// Standard deviation of the error of an object's observed position along each axis, drawn at every step, metres.
+    /// Standard deviation of the error of an object's observed position along each axis, drawn at every step, metres, 0
+    /// or more.
     pub position_noise_m: f32,
-    /// Horizontal distance between an arm's base and the place where it is believed to be, metres; the direction is drawn
-    /// for each arm and episode. Positions of objects and goals, which a camera measures in the world frame, are wrong by
-    /// this distance in the arm's frame. The hand's own position is not.
+    /// Horizontal distance between an arm's base and the place where it is believed to be, metres; the direction is
+    /// drawn for each arm and episode. Positions of objects and goals, which a camera measures in the world frame, are
+    /// wrong by this distance in the arm's frame. The hand's own position is not.
     pub base_offset_m: f32,
     /// Control steps by which actions take effect late. Until the first one does, the arms get actions of 0.
     pub delay_steps: usize,

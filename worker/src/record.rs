@@ -113,7 +113,7 @@ pub fn metadata_of(
 /// Returns the start of a logged episode.
 ///
 /// # Errors
-/// When the metadata lack an entry, or only earlier versions have such starts.
+/// When the metadata lack an entry or have one that is out of its range, or only earlier versions have such starts.
 pub fn start_of(metadata: &EpisodeMetadata) -> Result<EpisodeStart, RecordError> {
     let entry = |key: &str| metadata.world.get(key).map(String::as_str);
     let settings = WorldSettings::from_log_entries(entry)
@@ -130,7 +130,8 @@ pub fn start_of(metadata: &EpisodeMetadata) -> Result<EpisodeStart, RecordError>
 /// Builds the world of a logged episode of a built-in task, in the episode's start state.
 ///
 /// # Errors
-/// When the task is not built-in, the metadata lack an entry or the world cannot be built.
+/// When the task is not built-in, the metadata lack an entry or have one that is out of its range, only earlier
+/// versions have such starts, or the world cannot be built.
 pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
     let no_simulator = || RecordError::NoSimulator { task: metadata.layout.name().to_owned() };
     world_in(metadata.layout.as_built_in().ok_or_else(no_simulator)?, metadata)
@@ -161,7 +162,8 @@ pub fn log_name(episode: &Episode) -> String {
 /// the world that `metadata` describes, for the scenes of its log.
 ///
 /// # Errors
-/// When the episode, simulated again, differs from `episode`, or the log cannot be written. In that case no log remains.
+/// When the world cannot be built, the episode, simulated again, differs from `episode`, or the log cannot be written.
+/// An incomplete log, `NAME.mcap.part`, may remain then.
 pub fn record_episode(
     metadata: &EpisodeMetadata,
     episode: &Episode,
@@ -190,11 +192,11 @@ pub fn record_episode(
     Ok(recorder.finish()?)
 }
 
-/// Logs `episode` at `path` with the scenes and the advice of its `trace`, and returns the finished file's path. Nothing
-/// is simulated.
+/// Logs `episode` at `path` with the scenes and the advice of its `trace`, and returns the finished file's path.
+/// Nothing is simulated.
 ///
 /// # Errors
-/// When the log cannot be written. In that case no finished log remains.
+/// When the log cannot be written. An incomplete log, `NAME.mcap.part`, may remain then.
 pub fn record_traced(
     metadata: &EpisodeMetadata,
     episode: &Episode,

@@ -11,8 +11,8 @@ use crate::record::{RecordError, rewards_per_arm, start_of, world_of};
 /// truncated log is compared up to its end.
 ///
 /// # Errors
-/// [`RecordError::Differs`] with the first value that differs, [`RecordError::NoSimulator`] if the task is not built-in.
-/// Other errors mean that the log's world cannot be built or simulated.
+/// [`RecordError::Differs`] with the first value that differs, [`RecordError::NoSimulator`] if the task is not
+/// built-in. Other errors mean that the log's world cannot be built or simulated.
 pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
     let comparison = Comparison::of(log)?;
     let mut world = world_of(&log.metadata)?;

@@ -4,8 +4,8 @@ use toml_edit::{DocumentMut, Item, value};
 
 use crate::cell_file::{ArmTiming, CellFile, CellFileError};
 
-/// Returns the text of a cell file with new times of its arms, in the order of the file. Other keys and comments stay as
-/// they are.
+/// Returns the text of a cell file with new times of its arms, in the order of the file. Other keys and comments stay
+/// as they are.
 ///
 /// # Errors
 /// Returns the first problem of the text or of the new times.

@@ -21,7 +21,8 @@ impl<D: Driver> Executor<D> {
         self.state.stop()
     }
 
-    /// The newest cause of a stop while the arms are stopped: the one that stopped them, or a later one that would have.
+    /// The newest cause of a stop while the arms are stopped: the one that stopped them, or a later one that would
+    /// have.
     #[must_use]
     pub fn newest_stop(&self) -> Option<&Stop> {
         self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))

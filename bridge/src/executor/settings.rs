@@ -5,6 +5,10 @@ use tandem_kinematics::{CheckSettings, WorkCell};
 use crate::work_cell::check_settings;
 
 /// The limits of the executor and its assumptions about the drives.
+///
+/// Numbers are finite and above 0, but the lag and the feedback gain may be 0. The lag and a period are at most the
+/// reaction, `brake_s` is at most `ramp_s` of the limits and at most half of `pause_s`, gaps are smaller than those of
+/// `check`, and of hold, stop and lease each time is at most the next one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
     /// The limits that a motion has to keep to be started, and the largest speeds and accelerations during playback.
@@ -23,7 +27,7 @@ pub struct Settings {
     pub brake_s: f64,
     /// Usual time from a command until measured angles reflect it, seconds.
     pub lag_s: f64,
-    /// Feedback gain of the joints' angles, 1/s.
+    /// Feedback gain of the joints' angles, 1/s. Its product with the lag is below 0.5.
     pub gain_per_s: f64,
     /// Largest tracking error of a joint, radians.
     pub tracking_rad: f64,
@@ -35,7 +39,7 @@ pub struct Settings {
     pub jump_rad: f64,
     /// Highest measured speed of a joint, as a share of its limit.
     pub overspeed_share: f64,
-    /// Largest external torque, newton metres.
+    /// Largest external torque on a joint, newton metres.
     pub torque_nm: f64,
     /// A joint that is commanded to move faster than this has to report changing angles, radians per second.
     pub frozen_radps: f64,

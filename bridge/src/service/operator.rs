@@ -36,7 +36,8 @@ impl Operator {
     /// Stops the arms before all waiting calls. Returns the stop that they are in, which may precede this call.
     ///
     /// # Errors
-    /// Returns an error if the drives could not be commanded to stop, or the thread does not respond.
+    /// Returns an error if the drives could not be commanded to stop, the arms do not confirm it in time, or the thread
+    /// does not respond.
     pub async fn stop(&self) -> Result<Option<Stop>, Error> {
         Ok(self.0.stop().await?.stopped.clone())
     }

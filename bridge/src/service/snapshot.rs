@@ -113,6 +113,9 @@ fn tools(cell: &WorkCell, angles: &[Joints]) -> Vec<[f64; 3]> {
 
 /// Creates a queue of at most `capacity` snapshots. The arms' thread never waits for it: what does not fit is lost and
 /// counted.
+///
+/// # Panics
+/// If `capacity` is 0.
 #[must_use]
 pub fn observe(capacity: usize) -> (Observer, Snapshots) {
     let (queue, waiting) = mpsc::channel(capacity);

@@ -8,8 +8,8 @@ use crate::layout::{ArmIndex, Layout};
 impl TaskSpec {
     /// Returns the one-arm task of which each arm's part is an instance: the task of a teacher.
     ///
-    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation. A task of
-    /// one arm is its own one-arm task if its vectors have the order of the arm's parts.
+    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation. A task
+    /// of one arm is its own one-arm task if its vectors have the order of the arm's parts.
     #[must_use]
     pub fn single_arm(&self) -> Option<Self> {
         if self.n_arms() == 1 && self.is_in_arm_order() {

@@ -29,7 +29,7 @@ pub struct TaskDescription {
     pub achieved_goal: Vec<usize>,
     /// Control steps per episode, 1 to 10,000.
     pub episode_steps: usize,
-    /// Distance up to which a goal counts as achieved, in the unit of the goal.
+    /// Distance up to which a goal counts as achieved, in the unit of the goal, above 0.
     pub tolerance: f32,
     /// Norm of the difference between achieved and desired goal.
     pub norm: Norm,
@@ -39,25 +39,26 @@ pub struct TaskDescription {
     /// Whether steps report contacts between arms and with the table.
     #[serde(default)]
     pub reports_contacts: bool,
-    /// Distance between the origins of two arms along the axis of [`ArmDescription::position`]. Each arm's axis points
-    /// at the other arm.
+    /// Distance between the origins of two arms along the axis of [`ArmDescription::position`], in the unit of these
+    /// positions, 0 or more. Each arm's axis points at the other arm.
     #[serde(default)]
     pub origin_distance: f32,
-    /// Smallest gap between two arms whose parts come from different steps: along that axis, or in the plane if
-    /// [`ArmDescription::lateral`] is given.
+    /// Smallest gap between two arms whose parts come from different steps, 0 or more: along that axis, or in the plane
+    /// if [`ArmDescription::lateral`] is given.
     #[serde(default)]
     pub recombination_gap: f32,
     /// Coordinate of each arm's base along that axis, arm frame. Between its base and its first position, an arm
     /// occupies the plane.
     #[serde(default)]
     pub base: f32,
-    /// Distances along that axis, across it and up: hands ([`ArmDescription::hand`]) that are nearer to each other along all
-    /// three are in contact. Three numbers, or none if that is unknown.
+    /// Distances along that axis, across it and up: hands ([`ArmDescription::hand`]) that are nearer to each other
+    /// along all three are in contact. Three numbers above 0, or none if that is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub contact_distances: Vec<f32>,
-    /// Largest magnitude of each number of an observation, shape `[n_observation]`.
+    /// Largest magnitude of each number of an observation, above 0, shape `[n_observation]`. A learner refuses episodes
+    /// with larger ones.
     pub observation_bound: Vec<f32>,
-    /// Largest magnitude of each number of a goal, shape `[n_goal]`.
+    /// Largest magnitude of each number of a desired goal, above 0, shape `[n_goal]`.
     pub goal_bound: Vec<f32>,
     /// The arms in order, 1 to 8.
     pub arms: Vec<ArmDescription>,
@@ -117,7 +118,8 @@ impl Norm {
         self.of_accumulated(self.accumulate(a, b))
     }
 
-    /// Returns the share of two parts of points in the distance between the points: see [`Norm::combined`].
+    /// Returns the share of two parts of points in the distance between the points: the sum of squared differences, or
+    /// the largest one. [`Norm::combined`] adds shares, [`Norm::of_accumulated`] gives the distance.
     ///
     /// # Panics
     /// If the parts differ in length.

@@ -15,8 +15,8 @@ pub struct Manipulation {
     pub shared_object: bool,
     /// Name of the task that each arm taken by itself performs, which is that of a teacher; empty if it is this task's.
     pub one_arm_task: String,
-    /// Number of control steps at the end of an episode after all of which the goal must be achieved, 1 to the steps of an
-    /// episode.
+    /// Number of control steps at the end of an episode after all of which the goal must be achieved, 1 to the steps of
+    /// an episode.
     pub success_steps: usize,
     /// The arms in order, or none.
     pub arms: Vec<ArmManipulation>,
@@ -28,9 +28,9 @@ pub struct Manipulation {
 pub struct ArmManipulation {
     /// Index of the action that opens the gripper if it is positive. Exploration opens no gripper that holds an object.
     pub gripper: Option<usize>,
-    /// The conditions under which the arm holds its object. If there are any, success needs them.
+    /// The conditions under which the arm holds its object, at most 16. If there are any, success needs them.
     pub holding: Vec<Condition>,
-    /// Further conditions of success.
+    /// Further conditions of success, at most 16.
     pub conditions: Vec<Condition>,
 }
 
@@ -43,7 +43,7 @@ pub struct Condition {
     /// The values from which the distance is measured, one for each index; empty means zeros.
     #[serde(default)]
     pub target: Vec<f32>,
-    /// The largest distance, in the task's norm.
+    /// The largest distance, in the task's norm, 0 or more.
     pub tolerance: f32,
 }
 

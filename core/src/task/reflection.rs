@@ -5,9 +5,9 @@ use serde::{Deserialize, Serialize};
 use super::{Part, TaskDescription, TaskSpec};
 use crate::layout::ArmIndex;
 
-/// A reflection that turns an arm's part of a valid transition into that of another one, such as that of a table about the
-/// vertical plane through the arm's base. With several arms it holds while the arm is far enough from the others to be
-/// recombined, or always if it is that of the whole scene. The default is no reflection.
+/// A reflection that turns an arm's part of a valid transition into that of another one, such as that of a table about
+/// the vertical plane through the arm's base. With several arms it holds while the arm is far enough from the others to
+/// be recombined, or always if it is that of the whole scene. The default is no reflection.
 ///
 /// Places are indices within the vector of one arm: 0 is the arm's first number.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, Serialize)]
@@ -27,8 +27,8 @@ pub struct Reflection {
     pub moved: Vec<[usize; 2]>,
     /// Coordinate of the plane.
     pub plane: f32,
-    /// Whether the arms and their links mirror each other about one plane, so that all arms of a transition can be reflected
-    /// at once, however near they are.
+    /// Whether the arms and their links mirror each other about one plane, so that all arms of a transition can be
+    /// reflected at once, however near they are.
     pub whole_scene: bool,
 }
 

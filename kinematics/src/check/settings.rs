@@ -6,7 +6,7 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal};
 use crate::self_collision::SELF_GAP_M;
 
-/// The limits that a motion must keep.
+/// The limits that a motion must keep. Numbers are finite and 0 or more.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CheckSettings {
     /// Speeds and accelerations. Those of the joints are the arm's own.

@@ -24,7 +24,8 @@ impl QueryGate {
     /// Creates the gate that was published beside an actor; `None` if there is none.
     ///
     /// # Errors
-    /// Returns an error if the parameters do not match `layout` or are not finite.
+    /// Returns an error if a size is out of range, a vector does not have the length that follows from `layout` and the
+    /// sizes, a number is not finite, or a standard deviation is not above 0.
     pub fn new(layout: &TaskSpec, published: &PublishedActor) -> Result<Option<Self>, Error> {
         let Some(gate) = &published.gate else { return Ok(None) };
         let PublishedGate { n_critics, n_hidden, n_hidden_layers, n_heads, threshold, .. } = *gate;
@@ -46,8 +47,9 @@ impl QueryGate {
         Ok(Some(Self { values: vec![0.0; critics.len() * n_heads], critics, threshold }))
     }
 
-    /// Returns true if the student is to ask: for an arm, the standard deviation of the critics' values of `action`,
-    /// shape `[n_action]`, exceeds the threshold. Shapes: `observation` `[n_observation]`, `goal` `[n_goal]`.
+    /// Returns true if the student is to ask: if, for at least one head, the population standard deviation of the
+    /// critics' values of `action`, shape `[n_action]`, exceeds the threshold. Shapes: `observation` `[n_observation]`,
+    /// `goal` `[n_goal]`.
     ///
     /// # Panics
     /// If the lengths do not match the layout.

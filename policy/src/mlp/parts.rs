@@ -234,8 +234,8 @@ impl RowBlock<'_> {
 }
 
 impl Activations {
-    /// Computes the gradient of the loss with respect to the parameters of `block`, from its gradient with respect to the
-    /// output, shape `[batch, n_output]`, after a [`RowBlock::backward`] pass over every row of `input`, shape
+    /// Computes the gradient of the loss with respect to the parameters of `block`, from its gradient with respect to
+    /// the output, shape `[batch, n_output]`, after a [`RowBlock::backward`] pass over every row of `input`, shape
     /// `[batch, n_input]`.
     ///
     /// # Panics
@@ -305,12 +305,12 @@ impl TransposedWeights {
         blocks
     }
 
-    /// Returns the weights of all layers in a row, for elementwise work.
+    /// Returns the weights of all layers, one layer after the other, for elementwise work.
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
         &mut self.0
     }
 
-    /// Returns the weights of all layers in a row.
+    /// Returns the weights of all layers, one layer after the other.
     #[must_use]
     pub fn as_slice(&self) -> &[f32] {
         &self.0

@@ -14,8 +14,8 @@ const MAX_TRANSITIONS: usize = 65_536;
 pub struct DdpgConfig {
     /// Discount per control step, in [0, 1) (paper, section 4.1: 0.98).
     pub discount: f32,
-    /// Discount from three quarters of the run's environment steps on, in [0, 1). From one quarter, the horizon
-    /// 1 / (1 - discount) grows linearly until then. 0 keeps `discount`, as does a run without a limit in environment steps.
+    /// Discount from three quarters of the run's environment steps on, in [0, 1). From one quarter, the horizon 1 / (1
+    /// - discount) grows linearly until then. 0 keeps `discount`, as does a run without a limit in environment steps.
     #[serde(default)]
     pub final_discount: f32,
     /// Weight of the mean squared action in the actor's loss, 0 or more (HER reference implementation: `action_l2` =
@@ -24,13 +24,13 @@ pub struct DdpgConfig {
     /// Weight of behaviour cloning in the actor's loss: of the squared error to the teacher's action where that was
     /// executed, 0 or more (paper: 0).
     pub bc_weight: f32,
-    /// Fraction of `bc_weight` that remains at the end of the run, in [0, 1]. The weight falls linearly from one quarter
-    /// to three quarters of `stop.max_env_steps`; a run without that limit keeps it.
+    /// Fraction of `bc_weight` that remains at the end of the run, in [0, 1]. The weight falls linearly from one
+    /// quarter to three quarters of `stop.max_env_steps`; a run without that limit keeps it.
     #[serde(default = "all_of_it")]
     pub bc_final_fraction: f32,
-    /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's own
-    /// action, in [0, 1]: the Q-filter of Nair et al. 2018, equation 4. With a value per arm, the advice to an arm is
-    /// compared by the arm's own value. 1 is never; a run without that limit never filters.
+    /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's
+    /// own action, in [0, 1]: the Q-filter of Nair et al. 2018, equation 4. With a value per arm, the advice to an arm
+    /// is compared by the arm's own value. 1 is never; a run without that limit never filters.
     #[serde(default = "never")]
     pub bc_filter_start: f32,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It

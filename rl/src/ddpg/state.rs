@@ -7,9 +7,9 @@ use super::{Ddpg, DdpgConfig, DdpgError};
 /// A batch of the student's critic.
 #[derive(Debug, Clone, Copy)]
 pub struct CriticBatch<'a> {
-    /// Normalised observation, normalised goal and executed action, shape `[b, n_input + n_action]`.
+    /// Normalised observation, normalised goal and executed action, shape `[b, n_observation + n_goal + n_action]`.
     pub inputs: &'a [f32],
-    /// Targets, shape `[b, n_heads]`.
+    /// Targets `y` of equation 5 of the paper, shape `[b, n_heads]`.
     pub targets: &'a [f32],
 }
 
@@ -38,25 +38,25 @@ impl Ddpg {
         &self.critic.shape
     }
 
-    /// Returns the actor's parameters, flat.
+    /// Returns the actor's parameters, shape `[n_parameters]` of [`actor_shape`](Self::actor_shape).
     #[must_use]
     pub fn actor(&self) -> &[f32] {
         &self.actor.online
     }
 
-    /// Returns the parameters of the actor's target network, flat.
+    /// Returns the parameters of the actor's target network, of the same shape.
     #[must_use]
     pub fn target_actor(&self) -> &[f32] {
         &self.actor.target
     }
 
-    /// Returns the critic's parameters, flat.
+    /// Returns the critic's parameters, shape `[n_parameters]` of [`critic_shape`](Self::critic_shape).
     #[must_use]
     pub fn critic(&self) -> &[f32] {
         &self.critic.online
     }
 
-    /// Returns the parameters of the critic's target network, flat.
+    /// Returns the parameters of the critic's target network, of the same shape.
     #[must_use]
     pub fn target_critic(&self) -> &[f32] {
         &self.critic.target
@@ -68,7 +68,7 @@ impl Ddpg {
         CriticBatch { inputs: &self.critic_half.input, targets: &self.critic_half.targets }
     }
 
-    /// Returns the gradients of the last update: the actor's and the critic's.
+    /// Returns the gradients of the losses by the parameters in the last update: the actor's and the critic's.
     #[must_use]
     pub fn gradients(&self) -> [&[f32]; 2] {
         [&self.actor.gradient, &self.critic.gradient]

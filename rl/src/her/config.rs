@@ -53,9 +53,9 @@ pub struct ReplayConfig {
     /// Probability that the arms of a transition exchange places, in [0, 1]: an exact symmetry of worlds whose arms are
     /// interchangeable.
     pub arm_swap_prob: f32,
-    /// Probability that a transition is reflected, in [0, 1] (invariant transform experience replay, Lin et al. 2020). It
-    /// takes effect in tasks that describe a reflection only, as those of the shared world do, and unless their whole scene
-    /// has a mirror image, while arms are far enough apart to be recombined.
+    /// Probability that a transition is reflected, in [0, 1] (invariant transform experience replay, Lin et al. 2020).
+    /// It takes effect in tasks that describe a reflection only, as those of the shared world do, and unless their
+    /// whole scene has a mirror image, while arms are far enough apart to be recombined.
     #[serde(default)]
     pub reflection_prob: f32,
     /// The reward that the critic learns.
@@ -65,17 +65,19 @@ pub struct ReplayConfig {
     #[serde(default)]
     pub joint_goal_statistics: bool,
     /// Distance between an object and its goal, in the unit of the goal, within which training rewards it: in the
-    /// built-in tasks 0.0001 to 1 m, else above 0 (paper: 0.05 m). The task's own tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
+    /// built-in tasks 0.0001 to 1 m, else above 0 (paper: not given; Fetch environments: 0.05 m). The task's own
+    /// tolerance always defines success. A smaller distance leaves room for the motion of an object after its release.
     pub goal_tolerance_m: f32,
-    /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper: 0). A
-    /// contact with the table costs every arm unless the environment says which arm it was, as the shared world does.
+    /// Cost to an arm of a step on which it touches another arm or the table, 0 to 100; a pending goal costs 1 (paper:
+    /// 0). A contact with the table costs every arm unless the environment says which arm it was, as the shared world
+    /// does.
     pub contact_cost: f32,
-    /// Factor by which this cost grows, 1 to 100: linearly from a tenth to half of the run's environment steps, so that the
-    /// policy first learns to achieve goals (paper: 1). A run without a limit in environment steps keeps the cost.
+    /// Factor by which this cost grows, 1 to 100: linearly from a tenth to half of the run's environment steps, so that
+    /// the policy first learns to achieve goals (paper: 1). A run without a limit in environment steps keeps the cost.
     #[serde(default = "constant")]
     pub contact_cost_growth: f32,
-    /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of the
-    /// contact, 0 to the episode's steps (paper: 0).
+    /// An arm's advice is not cloned on the last steps before a contact that costs it: this many, counting the step of
+    /// the contact, 0 to the episode's steps (paper: 0).
     pub contact_foresight_steps: usize,
 }
 
@@ -85,7 +87,7 @@ const fn constant() -> f32 {
 }
 
 impl ReplayConfig {
-    /// Returns the lowest reward of a step.
+    /// Returns the lowest reward of a step: that of a pending goal and the largest cost of a contact.
     #[must_use]
     pub const fn lowest_reward(&self) -> f32 {
         -1.0 - self.contact_cost * self.contact_cost_growth

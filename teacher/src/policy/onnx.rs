@@ -26,8 +26,8 @@ impl OnnxPolicy {
     /// The task is the one in the actor's metadata, or the one that its inputs and outputs fit.
     ///
     /// # Errors
-    /// When a file cannot be read, its graph is not supported, the models are not for one arm and the same task, or their
-    /// metadata says that they are parts of different policies.
+    /// When a file cannot be read, its graph is not supported, the models are not for one arm and the same task, or
+    /// their metadata says that they are parts of different policies.
     pub fn load(actor: &Path, critic: Option<&Path>) -> Result<Self, Error> {
         let model = Model::load(actor)?;
         let layout = layout_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;

@@ -19,8 +19,8 @@ use crate::log_name::LogName;
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 /// Plays the newest evaluation episodes of a directory in real time, one after the other, as workers finish their logs.
-/// While there is no new one, it plays the newest training episode, if these are recorded. A viewer that subscribes later
-/// gets the present state, or the last one of the latest episode.
+/// While there is no new one, it plays the newest training episode, if these are recorded. A viewer that subscribes
+/// later gets the present state, or the last one of the latest episode.
 pub struct Follower {
     server: Server,
     address: SocketAddr,
@@ -52,8 +52,8 @@ impl ServerListener for Subscribed {
 }
 
 impl Follower {
-    /// Listens on `address`; port 0 selects a free port. Logs that are in `directory` already are not played; it need not
-    /// exist yet.
+    /// Listens on `address`; port 0 selects a free port. Logs that are in `directory` already are not played; it need
+    /// not exist yet.
     ///
     /// # Errors
     /// If the address cannot be listened on.

@@ -41,7 +41,7 @@ pub struct SimulatedConfig {
     pub gripper: GripperConfig,
     /// The cameras that observe the objects.
     pub camera: CameraConfig,
-    /// Friction between objects and table.
+    /// Coulomb friction coefficient between objects and table.
     pub table_friction: f32,
     /// The blocks on the table.
     pub blocks: Vec<Block>,
@@ -56,7 +56,7 @@ pub struct GripperConfig {
     pub grip_n: f32,
     /// Largest change of the opening, 1/s; 1 is from closed to open.
     pub opening_per_s: f32,
-    /// Friction between the fingers' pads and objects.
+    /// Coulomb friction coefficient between the fingers' pads and objects.
     pub pad_friction: f32,
     /// Mass of a finger, kilograms.
     pub finger_kg: f32,

@@ -11,8 +11,8 @@
 //! moves to the position of that hand after the step, and the policy observes its velocity. Objects have the hand's
 //! velocity to the extent that they moved with it.
 //!
-//! **Openings.** The policy knows the training world's gripper and blocks of one size. Three openings correspond: closed,
-//! open, and just touching the block. Openings in between are interpolated linearly.
+//! **Openings.** The policy knows the training world's gripper and blocks of one size. Three openings correspond:
+//! closed, open, and just touching the block. Openings in between are interpolated linearly.
 
 use glam::{DQuat, DVec3};
 use tandem_core::{ArmIndex, Layout};
@@ -34,6 +34,9 @@ const WITHDRAWN_M: [f64; 2] = [-0.05, 0.20];
 const TILT_ROUNDS: usize = 4;
 
 /// The mapping of a policy's world into a work cell.
+///
+/// # Panics
+/// Methods panic if there is no such arm, or an action is shorter than the task's for one arm.
 #[derive(Debug, Clone)]
 pub struct Mapping {
     cell: WorkCell,
@@ -53,9 +56,9 @@ pub struct Mapping {
 pub struct ArmObservation {
     /// The end effector, own frame, metres.
     pub hand: DVec3,
-    /// The velocity of the training world's end effector, metres per second.
+    /// The velocity of the training world's end effector, own frame, metres per second.
     pub hand_velocity: DVec3,
-    /// The opening of each side of the gripper, metres.
+    /// The opening of each side of the policy's gripper, metres; 0 in tasks without grasping.
     pub opening_m: f64,
     /// The object, own frame, metres.
     pub object: DVec3,
@@ -64,8 +67,9 @@ pub struct ArmObservation {
 }
 
 impl Mapping {
-    /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A shared
-    /// object counts as blocks of its width. The policy knows blocks with half an edge of `trained_half_m` metres.
+    /// Creates the mapping of the world of `layout`, with hands like `hand` and blocks like `block`, into `cell`. A
+    /// shared object counts as blocks of its width. The policy knows blocks with half an edge of `trained_half_m`
+    /// metres.
     #[must_use]
     pub fn new(
         cell: WorkCell,
@@ -188,7 +192,9 @@ impl Mapping {
         }
     }
 
-    /// Converts measurements of `arm` and its object to the policy's terms.
+    /// Converts measurements of `arm` and its object to the policy's terms: joint angles `angles` (radians), the real
+    /// gripper's `opening` (0 to 1), the velocity of the training world's hand (own frame, metres per second) and the
+    /// object as seen (world frame).
     #[must_use]
     pub fn observe(
         &self,
@@ -221,23 +227,24 @@ impl Mapping {
         self.hand.max_opening_m()
     }
 
-    /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above the
-    /// objects on the table; own frame, metres.
+    /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above
+    /// the objects on the table; own frame, metres.
     #[must_use]
     pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
         self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))
     }
 
-    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, in [−1,
-    /// 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, shape
+    /// `[action_per_arm]`, in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         self.hand.after(hand, velocity, action)
     }
 
-    /// Returns the opening of each side of the gripper to command after a step with `action`, metres. `commanded_m` was
-    /// commanded before and `actual_m` reached. A gripper that closes is commanded beyond an object between its pads,
-    /// which presses on it; one that opens starts from the object's size, as in the training world.
+    /// Returns the opening of each side of the policy's gripper to command after a step with `action` (one arm's, of a
+    /// task of grasping), metres. `commanded_m` was commanded before and `actual_m` reached, metres. A gripper that
+    /// closes is commanded beyond an object between its pads, which presses on it; one that opens starts from the
+    /// object's size, as in the training world.
     #[must_use]
     pub fn opening_after(&self, commanded_m: f64, actual_m: f64, action: &[f32]) -> f64 {
         if !self.layout.task.grasps() {

@@ -20,7 +20,7 @@ pub enum FailureCause {
     Refused(MotionRefusal),
     /// The rehearsal on a copy of the pair ended with this cause, so the pair has no motion. Nothing moved.
     NotRehearsed(Box<Self>),
-    /// The envelope stopped the arms.
+    /// The executor stopped the arms, for example because a command did not pass the envelope.
     Stopped(Stop),
     /// Parts of both arms touched.
     ArmsTouched,

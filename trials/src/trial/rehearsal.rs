@@ -30,7 +30,8 @@ pub struct TrialStart {
     pub yaws_rad: Vec<f64>,
     /// The goals, arm by arm, with the same heights.
     pub goals: Vec<DVec3>,
-    /// The object that all arms share, in the training world, if there is one. `objects` are then the arms' points of it.
+    /// The object that all arms share, in the training world, if there is one. `objects` are then the arms' points of
+    /// it.
     pub shared: Option<SharedObject>,
 }
 
@@ -42,8 +43,8 @@ const FIRST_OPENING: usize = 9;
 pub struct RolloutStep {
     /// The end effectors after the step, own frames, metres.
     pub hands: Vec<DVec3>,
-    /// The openings of the grippers before the step, of each side, metres. A gripper that holds an object is open as wide
-    /// as that.
+    /// The openings of the grippers before the step, of each side, metres. A gripper that holds an object is open as
+    /// wide as that.
     pub openings_m: Vec<f64>,
     /// The actions of all arms, shape `[n_action]`.
     pub action: Vec<f32>,
@@ -74,8 +75,8 @@ pub struct Rehearsal {
 }
 
 impl Rehearsal {
-    /// Creates the world of `layout` with blocks of the size and mass of `block`. An object that all arms share keeps its
-    /// own. Heights of objects and goals are those of blocks with half an edge of `trained_half_m` metres.
+    /// Creates the world of `layout` with blocks of the size and mass of `block`. An object that all arms share keeps
+    /// its own. Heights of objects and goals are those of blocks with half an edge of `trained_half_m` metres.
     ///
     /// # Errors
     /// Returns an error if there is no such world.

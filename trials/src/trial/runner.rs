@@ -91,10 +91,11 @@ impl TrialRunner {
         })
     }
 
-    /// Carries out trial `number`.
+    /// Carries out trial `number`. A trial that fails is a report with a cause.
     ///
     /// # Errors
-    /// Returns an error if the trial cannot start.
+    /// Returns an error if there is no room for the blocks, the arms cannot reach the start or are not reset, or the
+    /// training world fails.
     pub fn run(
         &mut self,
         number: u64,

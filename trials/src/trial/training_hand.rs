@@ -59,8 +59,11 @@ impl TrainingHand {
         self.control_step_s
     }
 
-    /// Returns the position and velocity of the hand after a step with `action` (one arm's, in [−1, 1]) from `hand` with
-    /// `velocity`; own frame, metres and metres per second.
+    /// Returns the position and velocity of the hand after a step with `action` (one arm's, shape `[action_per_arm]`,
+    /// in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    ///
+    /// # Panics
+    /// Panics if the action has fewer than three numbers.
     #[must_use]
     pub fn after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         let asked = DVec3::from_array([0, 1, 2].map(|axis| f64::from(action[axis])));
