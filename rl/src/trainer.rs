@@ -212,7 +212,7 @@ impl Trainer {
         let counts =
             |episode: &&Episode| share >= 1.0 || !orders::is_advised(episode.number, share);
         let counted = || episodes.iter().filter(counts);
-        let count = |n| u32::try_from(n).expect("a round has at most 262,144 episodes");
+        let count = |n| u32::try_from(n).expect("a round has at most 65,536 episodes");
         let n_succeeded = counted().filter(|episode| episode.succeeded()).count();
         jump_start.finish_round(count(counted().count()), count(n_succeeded));
     }

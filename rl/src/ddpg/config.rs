@@ -29,7 +29,7 @@ pub struct DdpgConfig {
     #[serde(default = "all_of_it")]
     pub bc_final_fraction: f32,
     /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's
-    /// own action, in [0, 1]: the Q-filter of Nair et al. 2018, equation 4. With a value per arm, the advice to an arm
+    /// own action, in [0, 1]: the Q-filter of Nair et al. 2018. With a value per arm, the advice to an arm
     /// is compared by the arm's own value. 1 is never; a run without that limit never filters.
     #[serde(default = "never")]
     pub bc_filter_start: f32,
