@@ -63,6 +63,12 @@ async fn play_one(toy: &mut Toy, teacher: &FakeTeacher) -> bool {
     toy.deliver(order.slot, &episodes).await.is_ok()
 }
 
+/// Returns the warning that the progress shows, empty if there is none.
+async fn warning(toy: &mut Toy) -> String {
+    let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
+    progress.into_inner().warning
+}
+
 /// An advised run that nothing happens to, and its teacher.
 async fn calm(run: RunConfig) -> (Left, FakeTeacher) {
     let directory = tempfile::tempdir().expect("a directory");
@@ -281,8 +287,7 @@ async fn a_new_run_warns_of_an_account_that_a_run_of_the_same_name_has_used() {
         let run_file = run_file.map(str::to_owned);
         let served = Served::start(LearnerConfig { run_file, ..config }).await;
         let mut toy = served.join("toy").await;
-        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
-        let warning = progress.into_inner().warning;
+        let warning = warning(&mut toy).await;
         assert_eq!(warning.is_empty(), expected.is_empty(), "{warning}");
         assert!(warning.starts_with(expected), "{warning}");
         served.shutdown.cancel();
@@ -300,16 +305,12 @@ async fn a_teacher_restarted_with_another_policy_is_warned_of() {
     let run = advised(0, AMPLE);
     let served = Served::start(with_teacher(run, directory.path(), false, address)).await;
     let mut toy = served.join("toy").await;
-    let mut warning = async || {
-        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
-        progress.into_inner().warning
-    };
     tokio::time::sleep(Duration::from_millis(1500)).await;
-    assert_eq!(warning().await, "", "the same policy");
+    assert_eq!(warning(&mut toy).await, "", "the same policy");
     teacher.books().policy_digest = "0b1c".repeat(16);
     let warned = async {
         loop {
-            match warning().await {
+            match warning(&mut toy).await {
                 text if text.is_empty() => tokio::time::sleep(Duration::from_millis(20)).await,
                 text => break text,
             }
@@ -344,8 +345,7 @@ async fn a_run_resumed_with_another_policy_of_its_teacher_is_warned_of() {
         let config = with_teacher(run.clone(), directory.path(), true, address);
         let served = Served::start(config).await;
         let mut toy = served.join("toy").await;
-        let progress = toy.client.status(pb::StatusRequest {}).await.expect("answers");
-        let warning = progress.into_inner().warning;
+        let warning = warning(&mut toy).await;
         assert_eq!(warning.is_empty(), expected.is_empty(), "{warning}");
         assert!(warning.starts_with(expected), "{warning}");
         served.shutdown.cancel();
