@@ -11,7 +11,6 @@ use std::time::Instant;
 use tandem_core::layout::EPISODE_STEPS;
 use tandem_core::{Episode, Layout, Task};
 use tandem_learner::checkpoint::{self, Resumption};
-use tandem_learner::evaluation_store::EvaluationHistory;
 use tandem_rl::RunConfig;
 use tandem_rl::config::Recipe;
 use tandem_rl::trainer::Trainer;
@@ -29,13 +28,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for _ in 0..N_TRANSITIONS / EPISODE_STEPS {
         trainer.ingest(std::slice::from_ref(&episode));
     }
-    let resumption = Resumption {
-        acting: trainer.publish(),
-        history: EvaluationHistory::default(),
-        pending: Vec::new(),
-        wall_s: 0.0,
-        teacher_policy: None,
-    };
+    let resumption = Resumption::of_new_run(trainer.publish());
     for _ in 0..N_TIMES {
         let start = Instant::now();
         let saved = checkpoint::save(&directory, &trainer, &resumption, 1)?;

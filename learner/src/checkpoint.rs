@@ -36,6 +36,20 @@ pub struct Resumption {
     pub teacher_policy: Option<String>,
 }
 
+impl Resumption {
+    /// Returns the contents at the start of a run, whose first round `acting` plays.
+    #[must_use]
+    pub fn of_new_run(acting: PublishedActor) -> Self {
+        Self {
+            acting,
+            history: EvaluationHistory::default(),
+            pending: Vec::new(),
+            wall_s: 0.0,
+            teacher_policy: None,
+        }
+    }
+}
+
 /// An error about a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {

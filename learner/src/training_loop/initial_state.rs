@@ -18,7 +18,7 @@ use super::{Context, LearnerLoop, is_beyond_end};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
-use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
+use crate::evaluation_store::PendingEvaluation;
 use crate::progress::Phase;
 use crate::shared::LearnerConfig;
 
@@ -153,13 +153,7 @@ fn new_run(config: &LearnerConfig) -> Result<(Trainer, Resumption), Error> {
         let teacher = config.start_from.as_ref().ok_or_else(none)?;
         trainer.start_from(teacher).map_err(Error::StartFrom)?;
     }
-    let resumption = Resumption {
-        acting: trainer.publish(),
-        history: EvaluationHistory::default(),
-        pending: Vec::new(),
-        wall_s: 0.0,
-        teacher_policy: None,
-    };
+    let resumption = Resumption::of_new_run(trainer.publish());
     Ok((trainer, resumption))
 }
 
