@@ -311,7 +311,8 @@ impl EvaluationResult {
                 summary.collision_rate_before_success
             ));
         }
-        lines.extend(summary.avoidance_rate.map(|rate| share("avoidance", rate)));
+        let avoidance = summary.avoidance_rate.map(|rate| share("avoidance", rate));
+        lines.extend(avoidance.map(|avoidance| format!("{avoidance}: links kept apart")));
         let lost = share("lost goal", summary.lost_goal_rate);
         lines.push(format!("{lost}: achieved, not at the end"));
         lines.push(format!("mean return   {:.1}", summary.mean_return));

@@ -110,13 +110,15 @@ pub enum EnvironmentError {
 pub struct Simulator {
     prototype: Env,
     environments: Vec<Env>,
+    /// The steps of each environment's episode in which link avoidance limited an arm.
+    avoidance_steps: Vec<u32>,
 }
 
 impl Simulator {
     /// Creates environments that behave as `prototype` does.
     #[must_use]
     pub const fn new(prototype: Env) -> Self {
-        Self { prototype, environments: Vec::new() }
+        Self { prototype, environments: Vec::new(), avoidance_steps: Vec::new() }
     }
 }
 
@@ -129,6 +131,7 @@ impl Environment for Simulator {
     ) -> Result<(), EnvironmentError> {
         let layout = self.prototype.layout();
         self.environments.resize_with(starts.len(), || self.prototype.clone());
+        self.avoidance_steps = vec![0; starts.len()];
         let observations = observations.chunks_exact_mut(layout.n_observation());
         let rows = observations.zip(goals.chunks_exact_mut(layout.n_goal()));
         for ((env, start), (observation, goal)) in
@@ -151,13 +154,22 @@ impl Environment for Simulator {
         let layout = self.prototype.layout();
         let actions = actions.chunks_exact(layout.n_action());
         let rows = actions.zip(observations.chunks_exact_mut(layout.n_observation()));
-        let environments = self.environments.iter_mut().zip(contacts).enumerate();
-        for ((environment, (env, contacts)), (action, observation)) in environments.zip(rows) {
+        let environments =
+            self.environments.iter_mut().zip(contacts).zip(&mut self.avoidance_steps);
+        for ((environment, ((env, contacts), avoidance_steps)), (action, observation)) in
+            environments.enumerate().zip(rows)
+        {
             let failed = |source| EnvironmentError::Step { environment, source };
             *contacts = env.step(action).map_err(failed)?;
+            *avoidance_steps += u32::from(env.n_avoiding_substeps() > 0);
             env.observe(observation);
         }
         Ok(())
+    }
+
+    fn avoidance_steps(&self, environment: usize) -> Option<u32> {
+        let has_links_to_avoid = self.prototype.layout().n_arms > 1;
+        self.avoidance_steps.get(environment).copied().filter(|_| has_links_to_avoid)
     }
 
     fn scene(&self, environment: usize) -> Option<Scene> {
@@ -178,5 +190,59 @@ impl Act for Actor {
 
     fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
         self.asks(observation, goal, action)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{EpisodeKind, Layout, Task, WorldSettings};
+    use tandem_sim::WorldConfig;
+
+    use super::*;
+
+    fn simulator(n_arms: usize) -> Simulator {
+        let layout = Layout::new(Task::PickAndPlace, n_arms);
+        Simulator::new(Env::new(layout, &WorldConfig::default()).unwrap())
+    }
+
+    fn reset(simulator: &mut Simulator) {
+        let layout = simulator.prototype.layout();
+        let world = WorldSettings::default();
+        let start = EpisodeStart { seed: 1, number: 0, kind: EpisodeKind::Evaluation, world };
+        let (mut observation, mut goal) =
+            (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
+        simulator.reset(&[start], &mut observation, &mut goal).unwrap();
+    }
+
+    fn step(simulator: &mut Simulator, action: &[f32]) {
+        let mut observation = vec![0.0; simulator.prototype.layout().n_observation()];
+        simulator.step(action, &mut observation, &mut [Contacts::NONE]).unwrap();
+    }
+
+    #[test]
+    fn steps_of_link_avoidance_are_counted_per_episode() {
+        let mut simulator = simulator(2);
+        reset(&mut simulator);
+        step(&mut simulator, &[0.0; 8]);
+        assert_eq!(simulator.avoidance_steps(0), Some(0), "arms at rest avoid nothing");
+        // The first arm reaches for the second one, which stays.
+        let mut n_steps = 0;
+        for _ in 0..40 {
+            step(&mut simulator, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+            n_steps += u32::from(simulator.environments[0].n_avoiding_substeps() > 0);
+        }
+        assert!((1..40).contains(&n_steps), "limited in {n_steps} of 40 steps");
+        assert_eq!(simulator.avoidance_steps(0), Some(n_steps));
+        reset(&mut simulator);
+        assert_eq!(simulator.avoidance_steps(0), Some(0), "every episode counts from 0");
+        assert_eq!(simulator.avoidance_steps(1), None, "there is one environment");
+    }
+
+    #[test]
+    fn one_arm_has_no_link_avoidance() {
+        let mut simulator = simulator(1);
+        reset(&mut simulator);
+        step(&mut simulator, &[1.0; 4]);
+        assert_eq!(simulator.avoidance_steps(0), None);
     }
 }
