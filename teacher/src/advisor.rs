@@ -322,7 +322,7 @@ impl ScoredRequest<'_> {
                     charge.wanted_in_second_half |= second;
                 }
                 None => charges.push(Charge {
-                    episode: query.payer.unwrap_or(query.episode),
+                    episode: payer(query),
                     step: query.step,
                     wanted_in_first_half: first,
                     wanted_in_second_half: second,
@@ -356,19 +356,19 @@ impl ScoredRequest<'_> {
 
 /// Returns the index of each query's charge. Charges are in the order of their first query.
 fn charge_indices(queries: &[StepQuery]) -> Vec<usize> {
-    let mut shared: BTreeMap<(u64, u32), usize> = BTreeMap::new();
-    let mut n_charges = 0;
-    let mut next = || {
-        n_charges += 1;
-        n_charges - 1
-    };
+    let mut by_step: BTreeMap<(u64, u32), usize> = BTreeMap::new();
     queries
         .iter()
-        .map(|query| match query.payer {
-            Some(payer) => *shared.entry((payer, query.step)).or_insert_with(&mut next),
-            None => next(),
+        .map(|query| {
+            let next = by_step.len();
+            *by_step.entry((payer(query), query.step)).or_insert(next)
         })
         .collect()
+}
+
+/// Returns the number of the episode that pays for the step.
+fn payer(query: &StepQuery) -> u64 {
+    query.payer.unwrap_or(query.episode)
 }
 
 /// Overrides the arms that the strategy selects, if a unit was charged for the step.

@@ -213,6 +213,19 @@ fn queries_of_one_payer_and_step_share_a_unit() {
 }
 
 #[test]
+fn a_query_without_payer_shares_the_unit_of_queries_that_name_its_episode() {
+    let near = query(1, 0, 0.0, 0.0);
+    let far = query(1, 0, 0.5, 0.25);
+    let paid_by_it = StepQuery { episode: 2, payer: Some(1), ..far.clone() };
+    for queries in [[near.clone(), paid_by_it.clone()], [paid_by_it, near.clone()], [near, far]] {
+        let advice = advise(&mut advisor(10, "mc-act:0.1"), "run", &queries).unwrap();
+        let charged: Vec<bool> = advice.steps.iter().map(|step| step.charged).collect();
+        assert_eq!((charged, advice.budget_left), (vec![true; 2], 9), "{queries:?}");
+        assert!(advice.steps.iter().all(|step| !step.repeated), "one decision for both");
+    }
+}
+
+#[test]
 fn one_request_may_hold_students_of_several_layouts() {
     let mut advisor = advisor(10, "ea");
     let three_arms = StepQuery {
