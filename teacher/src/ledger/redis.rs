@@ -28,6 +28,8 @@ const KNOWN: u64 = 10;
 #[derive(Debug)]
 pub struct RedisLedger {
     server: Server,
+    /// The reason why the last script that writes failed, if it did.
+    warning: Option<String>,
 }
 
 impl RedisLedger {
@@ -55,17 +57,48 @@ impl RedisLedger {
                 "the server drops keys when its memory is full: set its maxmemory-policy to noeviction"
             );
         }
-        Ok(Self { server })
+        Ok(Self { server, warning: None })
     }
 
     /// Runs one script.
     fn call(&mut self, call: Call) -> Result<Reply, LedgerError> {
-        let mut replies = self.calls(&[call])?;
+        let replies = self.calls(&[call]);
+        let mut replies = replies.map_err(|error| self.unavailable(error))?;
         replies.pop().ok_or_else(|| self.invalid("no reply"))
     }
 
-    fn calls(&mut self, calls: &[Call]) -> Result<Vec<Reply>, LedgerError> {
-        self.server.run(calls).map_err(|error| self.unavailable(error))
+    /// Runs scripts, and stores the failure of those that write as the warning. A script that had nothing to write says
+    /// nothing about the next one.
+    fn calls(&mut self, calls: &[Call]) -> Result<Vec<Reply>, redis::RedisError> {
+        let outcome = self.server.run(calls);
+        match &outcome {
+            Ok(replies) => {
+                if calls.iter().zip(replies).any(|(call, reply)| has_written(call, reply)) {
+                    self.report(None);
+                }
+            }
+            Err(error) => {
+                if calls.iter().any(|call| call.script() != Script::Balance) {
+                    self.report(Some(error));
+                }
+            }
+        }
+        outcome
+    }
+
+    /// Stores the outcome of scripts that write as the warning, and logs when it differs from the previous one.
+    fn report(&mut self, error: Option<&redis::RedisError>) {
+        let name = self.server.name();
+        let of = |error: &redis::RedisError| {
+            format!("cannot write {name}: {}", printable(&error.to_string()))
+        };
+        let warning = error.map(of);
+        match (&self.warning, &warning) {
+            (None, Some(warning)) => tracing::error!("nothing can be charged: {warning}"),
+            (Some(_), None) => tracing::info!(ledger = name, "the ledger can be written again"),
+            _ => {}
+        }
+        self.warning = warning;
     }
 
     fn unavailable(&self, error: redis::RedisError) -> LedgerError {
@@ -168,7 +201,7 @@ impl Ledger for RedisLedger {
 
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         let calls: Vec<Call> = requests.iter().map(charge_call).collect();
-        match self.server.run(&calls) {
+        match self.calls(&calls) {
             Ok(replies) => {
                 let answered = requests.iter().zip(&replies);
                 answered.map(|(request, reply)| self.charge_result(request, reply)).collect()
@@ -178,6 +211,20 @@ impl Ledger for RedisLedger {
                 requests.iter().map(failed).collect()
             }
         }
+    }
+
+    fn warning(&self) -> Option<&str> {
+        self.warning.as_deref()
+    }
+}
+
+/// Returns true if the script of `call` has written something before it replied.
+fn has_written(call: &Call, reply: &Reply) -> bool {
+    match call.script() {
+        Script::Open => true,
+        Script::Balance => false,
+        Script::OpenLeases | Script::Settle => !reply.fields.is_empty(),
+        Script::Charge => reply.numbers.iter().any(|number| *number < KNOWN),
     }
 }
 

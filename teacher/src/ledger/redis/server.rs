@@ -23,7 +23,7 @@ macro_rules! on_account {
 }
 
 /// An operation on an account.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Script {
     Open,
     Balance,
@@ -82,6 +82,10 @@ pub(super) struct Server {
 impl Call {
     pub(super) fn new(script: Script, account: &str) -> Self {
         Self { script, account: account.to_owned(), args: Vec::new() }
+    }
+
+    pub(super) const fn script(&self) -> Script {
+        self.script
     }
 
     pub(super) fn arg(mut self, arg: impl fmt::Display) -> Self {
