@@ -10,7 +10,7 @@ use tandem_proto::DecodeError;
 
 use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease};
 use crate::error::Error;
-use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
+use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, printable};
 use crate::maps::Maps;
 use crate::policy::AnyPolicy;
 use crate::strategy::{Strategy, procedure};
@@ -28,6 +28,8 @@ pub struct Advisor {
     strategies: BTreeMap<String, Strategy>,
     /// Accounts for which a step was asked about again with other numbers, so that each gets one warning.
     reused: BTreeSet<String>,
+    /// The reason why the latest batch could not be evaluated, if it could not.
+    policy_failure: Option<String>,
     /// Whether the service ends when the ledger must be opened again.
     ends_for_restart: bool,
 }
@@ -92,6 +94,7 @@ impl Advisor {
             ledger,
             strategies: BTreeMap::new(),
             reused: BTreeSet::new(),
+            policy_failure: None,
             ends_for_restart: false,
         })
     }
@@ -135,10 +138,11 @@ impl Advisor {
         Ok(self.ledger.balance(name)?)
     }
 
-    /// Returns the reason why the ledger could not be written, if the last attempt failed.
+    /// Returns the reason why the ledger could not be written, if the last attempt failed, or else the reason why the
+    /// policy could not be evaluated, if the last attempt failed.
     #[must_use]
     pub fn warning(&self) -> Option<&str> {
-        self.ledger.warning()
+        self.ledger.warning().or(self.policy_failure.as_deref())
     }
 
     /// Reserves units of account `name` for `episodes`, in their order; see [`Account::open_leases`].
@@ -210,7 +214,9 @@ impl Advisor {
             requests.iter().map(|request| self.strategy(&request.account)).collect();
         let open = requests.iter().zip(&strategies).filter(|(_, strategy)| strategy.is_ok());
         let queries = open.flat_map(|(request, _)| &request.queries);
-        let mut arms = self.inference.score(&self.info.maps, queries).into_iter();
+        let scores = self.inference.score(&self.info.maps, queries);
+        self.note_failure(&scores);
+        let mut arms = scores.into_iter();
         let mut score = |request: &'a AdviceRequest, strategy| {
             let arms: Vec<_> = arms.by_ref().take(request.queries.len()).collect();
             let arms = arms.into_iter().collect::<Result<_, _>>()?;
@@ -221,6 +227,15 @@ impl Advisor {
             .zip(strategies)
             .map(|(request, strategy)| score(request, strategy?))
             .collect()
+    }
+
+    /// Stores the first failure among the scores of a batch. A batch without one ends the former failure.
+    fn note_failure(&mut self, scores: &[Result<Vec<ArmAdvice>, Error>]) {
+        if scores.is_empty() {
+            return;
+        }
+        let failure = scores.iter().find_map(|score| score.as_ref().err());
+        self.policy_failure = failure.map(|error| printable(&error.to_string()));
     }
 
     fn strategy(&mut self, account: &str) -> Result<Strategy, Error> {

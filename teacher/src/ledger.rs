@@ -262,7 +262,7 @@ fn cause(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
 const MAX_SHOWN_CHARS: usize = 300;
 
 /// Returns the beginning of a text from a file or a server, on one line and with control characters escaped.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     let mut shown = String::new();
     for character in text.chars().take(MAX_SHOWN_CHARS) {
         match character {

@@ -319,6 +319,21 @@ fn a_refused_request_does_not_affect_the_others_of_its_batch() {
     assert_eq!(advisor.balance("run").unwrap().spent, 3, "steps 0, 1 and 7");
 }
 
+#[test]
+fn a_policy_that_fails_is_a_warning_until_it_succeeds() {
+    let mut advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
+    let terms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
+    advisor.open_account("run", terms).unwrap();
+    let failing = query(1, 4, 0.95, 0.0);
+    let failure = advise(&mut advisor, "run", &[two_arms(0), failing]).unwrap_err().to_string();
+    assert!(failure.contains("not finite for step 4 of episode 1"), "{failure}");
+    assert_eq!(advisor.warning(), Some(failure.as_str()));
+    advise(&mut advisor, "run", &[]).unwrap();
+    assert_eq!(advisor.warning(), Some(failure.as_str()), "nothing was evaluated");
+    ask(&mut advisor, &two_arms(1));
+    assert_eq!(advisor.warning(), None);
+}
+
 /// Returns requests of several accounts and sizes, some of them for the same steps.
 fn many_requests() -> Vec<AdviceRequest> {
     let step = |number: u16| {
