@@ -4,10 +4,17 @@
 //! account have one hash tag. [`crate::budget::Account`] defines the scripts in `redis/`; the tests compare them with
 //! it. A script may be run again if its reply was lost.
 //!
-//! Durability depends on the server. With an append-only file a killed server loses next to nothing; a power cut or a
-//! failover to a replica may lose the last second (`appendfsync everysec`). The consequences are those that
-//! [`super::SqliteLedger`] documents for lost charges. Without an append-only file everything since the last snapshot
-//! is lost, and the ledger logs a warning.
+//! Durability depends on the server. With an append-only file a killed server loses next to nothing. A power cut may
+//! lose the last second (`appendfsync everysec`; with `always`, nothing), and a failover the operations that the replica
+//! has not received. Unlike [`super::SqliteLedger`], which may lose charges only, the server may lose any operation:
+//!
+//! - An account is unknown then. A learner opens it anew, with the units that its learned episodes leave.
+//! - An episode whose lease is lost spends units that are left, in the order of arrival, and may exceed its lease. Advice
+//!   then depends on timing.
+//! - Units of a settlement that is lost stay leased, and no other episode can spend them.
+//! - Lost charges have the consequences that [`super::SqliteLedger`] documents.
+//!
+//! Without an append-only file everything since the last snapshot is lost, and the ledger logs a warning.
 
 mod server;
 
