@@ -195,11 +195,16 @@ impl Advisor {
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
                 let balance = self.ledger.balance(&scored.request.account);
-                balance
-                    .map(|balance| ChargeResult { left: balance.left, ..ChargeResult::default() })
+                balance.map(|balance| ChargeResult {
+                    verdicts: Vec::new(),
+                    repeated: Vec::new(),
+                    left: balance.left,
+                    strategy: balance.terms.strategy,
+                })
             } else {
                 charged.next().expect("one result for each request")
             };
+            let charged = charged.and_then(|charged| self.check_strategy(&scored, charged));
             scored.into_advice(&self.info, charged)
         };
         scored.into_iter().map(|scored| answer(scored?)).collect()
@@ -283,6 +288,22 @@ impl Advisor {
                 self.strategies.remove(&request.account);
             }
         }
+    }
+
+    /// Refuses to answer by another strategy than the account has: a server has lost the account, and another teacher has
+    /// opened it anew. The repeated request is answered by the account's strategy.
+    fn check_strategy(
+        &mut self,
+        scored: &ScoredRequest<'_>,
+        charged: ChargeResult,
+    ) -> Result<ChargeResult, LedgerError> {
+        if charged.strategy == scored.strategy {
+            return Ok(charged);
+        }
+        let account = &scored.request.account;
+        self.strategies.remove(account);
+        let what = format!("account {account:?} now has strategy {}: ask again", charged.strategy);
+        Err(LedgerError::Unavailable { what, source: None })
     }
 
     /// Warns, once for each account, if a step was charged that the strategy would not charge now: the account remembers

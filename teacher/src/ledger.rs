@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use crate::budget::{
     AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease, MAX_BUDGET, Transaction,
 };
+use crate::strategy::Strategy;
 
 pub use memory::MemoryLedger;
 pub use redis::RedisLedger;
@@ -30,7 +31,7 @@ pub struct ChargeRequest {
 }
 
 /// The answer to a [`ChargeRequest`].
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ChargeResult {
     /// The verdict on each charge: the half of the budget whose unit the step cost, or `None` if it cost nothing.
     pub verdicts: Vec<Option<BudgetHalf>>,
@@ -38,6 +39,9 @@ pub struct ChargeResult {
     pub repeated: Vec<bool>,
     /// Units that are neither spent nor leased after the charges.
     pub left: u64,
+    /// The strategy of the account. It is not the one that callers know if a server has lost the account and another
+    /// teacher has opened it anew.
+    pub strategy: Strategy,
 }
 
 /// The reason why a ledger refuses an operation.
@@ -244,7 +248,8 @@ fn charge_all(
     let charged =
         charges.iter().map(|charge| (account.has_verdict(*charge), account.charge(*charge)));
     let (repeated, verdicts) = charged.unzip();
-    Ok(ChargeResult { verdicts, repeated, left: account.left() })
+    let strategy = account.terms().strategy;
+    Ok(ChargeResult { verdicts, repeated, left: account.left(), strategy })
 }
 
 /// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and

@@ -82,6 +82,15 @@ fn a_lost_account_is_judged_by_the_strategy_with_which_it_is_opened_anew() {
     advise(&mut advisor, "run", &[two_arms(0)]).unwrap_err();
     advisor.ledger.open("run", terms("mc-q:0.25")).unwrap();
     assert_eq!(ask(&mut advisor, &two_arms(0)).overridden_arms(), 0b00);
+
+    // Another teacher opens it before this one has noticed that it was lost.
+    advisor.ledger = Box::new(MemoryLedger::default());
+    advisor.ledger.open("run", terms("mc-q:0.0625")).unwrap();
+    let refused = advise(&mut advisor, "run", &[two_arms(0)]).unwrap_err().to_string();
+    let expected =
+        "the ledger cannot be used now: account \"run\" now has strategy mc-q:0.0625: ask again";
+    assert_eq!(refused, expected);
+    assert_eq!(ask(&mut advisor, &two_arms(1)).overridden_arms(), 0b01);
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::account::{Account, LeaseRecord};
 use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units, verdict_index};
-use super::{BudgetHalf, Charge, Lease};
+use super::{AccountTerms, BudgetHalf, Charge, Lease};
 
 /// A series of operations on an account. Each operation sees the changes of those before it; the account itself stays
 /// as it is until [`Account::apply`]. A ledger in a file writes the changes before it applies them.
@@ -49,6 +49,11 @@ impl<'a> Transaction<'a> {
     /// Ends the transaction and returns its changes.
     pub(crate) fn into_changes(self) -> Changes {
         self.changes
+    }
+
+    /// Returns the budget and the strategy of the account.
+    pub(crate) const fn terms(&self) -> AccountTerms {
+        self.account.terms()
     }
 
     /// Returns the units that are neither spent nor leased.

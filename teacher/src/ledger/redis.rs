@@ -151,7 +151,8 @@ impl RedisLedger {
             return Err(self.invalid("not one verdict for each charge"));
         }
         let repeated = reply.numbers.iter().map(|number| *number >= KNOWN).collect();
-        Ok(ChargeResult { verdicts, repeated, left: balance.left })
+        let Balance { terms: AccountTerms { strategy, .. }, left, .. } = balance;
+        Ok(ChargeResult { verdicts, repeated, left, strategy })
     }
 
     /// Returns the error for a reply or a value that no ledger writes.
