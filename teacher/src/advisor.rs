@@ -350,7 +350,10 @@ impl ScoredRequest<'_> {
         for ((query, arms), charge_idx) in
             self.request.queries.iter().zip(&self.arms).zip(charge_indices(&self.request.queries))
         {
-            let wanted = |half| overrides_any(self.strategy, (half, query.step), arms);
+            let wanted = |half| {
+                procedure(self.strategy, half, query.step)
+                    .is_some_and(|procedure| arms.iter().any(|arm| procedure.overrides(arm)))
+            };
             let (first, second) = (wanted(BudgetHalf::First), wanted(BudgetHalf::Second));
             match charges.get_mut(charge_idx) {
                 Some(charge) => {
@@ -415,9 +418,11 @@ fn step_advice(
     mut arms: Vec<ArmAdvice>,
     verdict: Option<BudgetHalf>,
 ) -> StepAdvice {
-    if let Some(half) = verdict {
+    if let Some(half) = verdict
+        && let Some(procedure) = procedure(strategy, half, query.step)
+    {
         for arm in &mut arms {
-            arm.overridden = overrides(strategy, (half, query.step), arm);
+            arm.overridden = procedure.overrides(arm);
         }
     }
     let action = compose(maps, &query.proposed_action, &arms);
@@ -430,14 +435,6 @@ fn compose(maps: &Maps, proposed_action: &[f32], arms: &[ArmAdvice]) -> Vec<f32>
         if arm.overridden { arm.teacher_action.as_slice() } else { map.arm_action(proposed_action) }
     });
     maps.joint_action(proposed_action.len(), chosen)
-}
-
-fn overrides(strategy: Strategy, (half, step): (BudgetHalf, u32), arm: &ArmAdvice) -> bool {
-    procedure(strategy, half, step).is_some_and(|procedure| procedure.overrides(arm))
-}
-
-fn overrides_any(strategy: Strategy, at: (BudgetHalf, u32), arms: &[ArmAdvice]) -> bool {
-    arms.iter().any(|arm| overrides(strategy, at, arm))
 }
 
 fn episode_steps(task: &TaskSpec) -> u32 {
