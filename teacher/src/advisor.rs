@@ -8,7 +8,7 @@ use tandem_core::task::MAX_ARMS;
 use tandem_core::{ArmAdvice, StepAdvice, StepQuery, TaskSpec};
 use tandem_proto::DecodeError;
 
-use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease};
+use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, BudgetHalves, Charge, Lease};
 use crate::error::Error;
 use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, printable};
 use crate::maps::Maps;
@@ -317,7 +317,7 @@ impl Advisor {
             let Ok(result) = result else { continue };
             let mut decided = request.charges.iter().zip(&result.verdicts);
             let is_contradicted = |(charge, verdict): &(&Charge, &Option<BudgetHalf>)| {
-                verdict.is_some_and(|half| !charge.is_wanted_in(half))
+                verdict.is_some_and(|half| !charge.wanted_in.contains(half))
             };
             let Some((charge, _)) = decided.find(is_contradicted) else { continue };
             if self.reused.len() < MAX_CACHED_STRATEGIES
@@ -354,18 +354,13 @@ impl ScoredRequest<'_> {
                 procedure(self.strategy, half, query.step)
                     .is_some_and(|procedure| arms.iter().any(|arm| procedure.overrides(arm)))
             };
-            let (first, second) = (wanted(BudgetHalf::First), wanted(BudgetHalf::Second));
+            let wanted_in = BudgetHalves {
+                first: wanted(BudgetHalf::First),
+                second: wanted(BudgetHalf::Second),
+            };
             match charges.get_mut(charge_idx) {
-                Some(charge) => {
-                    charge.wanted_in_first_half |= first;
-                    charge.wanted_in_second_half |= second;
-                }
-                None => charges.push(Charge {
-                    episode: payer(query),
-                    step: query.step,
-                    wanted_in_first_half: first,
-                    wanted_in_second_half: second,
-                }),
+                Some(charge) => charge.wanted_in = charge.wanted_in.union(wanted_in),
+                None => charges.push(Charge { episode: payer(query), step: query.step, wanted_in }),
             }
         }
         let account = || self.request.account.clone();

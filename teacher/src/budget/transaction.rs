@@ -108,7 +108,7 @@ impl<'a> Transaction<'a> {
         if let Some(verdict) = bits.get(step) {
             return verdict;
         }
-        let verdict = self.next_unit(episode).filter(|half| charge.is_wanted_in(*half));
+        let verdict = self.next_unit(episode).filter(|half| charge.wanted_in.contains(*half));
         if verdict.is_some() {
             self.spend_unit(episode);
         }

@@ -240,10 +240,10 @@ fn has_written(call: &Call, reply: &Reply) -> bool {
 fn charge_call(request: &ChargeRequest) -> Call {
     let mut call = Call::new(Script::Charge, &request.account);
     for charge in &request.charges {
-        let Charge { episode, step, .. } = charge;
+        let Charge { episode, step, wanted_in } = charge;
         let digit = |yes: bool| if yes { '1' } else { '0' };
-        let first = digit(charge.wanted_in_first_half);
-        let second = digit(charge.wanted_in_second_half);
+        let first = digit(wanted_in.first);
+        let second = digit(wanted_in.second);
         call = call
             .arg(episode)
             .arg(format_args!("{episode}:{}", step / STEPS_PER_FIELD))
