@@ -30,7 +30,7 @@ pub struct Advisor {
     reused: BTreeSet<String>,
     /// The reason why the latest batch could not be evaluated, if it could not.
     policy_failure: Option<String>,
-    /// Whether the service ends when the ledger must be opened again.
+    /// True if the service ends when the ledger must be opened again.
     ends_for_restart: bool,
 }
 
@@ -43,7 +43,7 @@ pub struct TeacherInfo {
     pub students: Vec<TaskSpec>,
     /// The digest of the policy.
     pub digest: String,
-    /// Whether the policy values actions.
+    /// True if the policy values actions.
     pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
@@ -106,7 +106,7 @@ impl Advisor {
         Self { ends_for_restart: true, ..self }
     }
 
-    /// Returns whether the service must end, because the ledger must be opened again.
+    /// Returns true if the service must end, because the ledger must be opened again.
     pub(crate) fn must_end(&self) -> bool {
         self.ends_for_restart && self.ledger.needs_restart()
     }

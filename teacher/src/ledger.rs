@@ -35,7 +35,7 @@ pub struct ChargeRequest {
 pub struct ChargeResult {
     /// The verdict on each charge: the half of the budget whose unit the step cost, or `None` if it cost nothing.
     pub verdicts: Vec<Option<BudgetHalf>>,
-    /// Whether each verdict is that of an earlier charge for the same step.
+    /// For each charge, true if its verdict is that of an earlier charge for the same step.
     pub repeated: Vec<bool>,
     /// Units that are neither spent nor leased after the charges.
     pub left: u64,
@@ -111,7 +111,7 @@ pub trait Ledger: Send {
         None
     }
 
-    /// Returns whether nothing more can be written until another process opens the ledger, which then has every answered
+    /// Returns true if nothing more can be written until another process opens the ledger, which then has every answered
     /// charge.
     fn needs_restart(&self) -> bool {
         false
@@ -252,7 +252,7 @@ fn charge_all(
     Ok(ChargeResult { verdicts, repeated, left: account.left(), strategy })
 }
 
-/// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
+/// Returns true if the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
 /// `episode_steps` steps; other episodes may have any length.
 fn is_beyond_end(account: &Transaction<'_>, charge: &Charge, episode_steps: u32) -> bool {
     charge.step >= episode_steps && account.has_lease(charge.episode)

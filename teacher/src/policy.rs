@@ -66,7 +66,7 @@ impl AnyPolicy {
         }
     }
 
-    /// Returns whether the policy values actions.
+    /// Returns true if the policy values actions.
     #[must_use]
     pub fn has_values(&self) -> bool {
         match self {

@@ -28,7 +28,7 @@ pub(crate) struct Changes {
 }
 
 impl Changes {
-    /// Returns whether no record has changed.
+    /// Returns true if no record has changed.
     pub(crate) fn is_empty(&self) -> bool {
         self.leases.is_empty() && self.verdicts.is_empty()
     }
@@ -61,7 +61,7 @@ impl<'a> Transaction<'a> {
         self.account.terms().budget - self.assigned()
     }
 
-    /// Returns whether units were ever reserved for `episode`.
+    /// Returns true if units were ever reserved for `episode`.
     pub(crate) fn has_lease(&self, episode: u64) -> bool {
         self.lease(episode).is_some()
     }
@@ -94,7 +94,7 @@ impl<'a> Transaction<'a> {
         }
     }
 
-    /// Returns whether there is a verdict on the step of `charge`.
+    /// Returns true if there is a verdict on the step of `charge`.
     pub(crate) fn has_verdict(&self, charge: Charge) -> bool {
         let bits = self.verdicts_at(verdict_index(charge.episode, charge.step));
         bits.is_some_and(|bits| bits.get(charge.step).is_some())

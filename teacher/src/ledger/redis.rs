@@ -28,8 +28,8 @@ use server::{Call, Reply, Script, Server};
 
 /// Steps whose verdicts share a field of the hash.
 const STEPS_PER_FIELD: u32 = 64;
-/// What the script adds to a verdict that it found.
-const KNOWN: u64 = 10;
+/// The number that the script adds to a verdict that it found.
+const KNOWN_OFFSET: u64 = 10;
 
 /// A ledger on a Redis server.
 #[derive(Debug)]
@@ -140,7 +140,7 @@ impl RedisLedger {
             let charge_idx = usize::try_from(*charge_idx).unwrap_or(usize::MAX);
             return Err(LedgerError::BeyondEnd { charge_idx });
         }
-        let verdict = |number: &u64| match number % KNOWN {
+        let verdict = |number: &u64| match number % KNOWN_OFFSET {
             0 => Ok(None),
             1 => Ok(Some(BudgetHalf::First)),
             2 => Ok(Some(BudgetHalf::Second)),
@@ -150,7 +150,7 @@ impl RedisLedger {
         if verdicts.len() != request.charges.len() {
             return Err(self.invalid("not one verdict for each charge"));
         }
-        let repeated = reply.numbers.iter().map(|number| *number >= KNOWN).collect();
+        let repeated = reply.numbers.iter().map(|number| *number >= KNOWN_OFFSET).collect();
         let Balance { terms: AccountTerms { strategy, .. }, left, .. } = balance;
         Ok(ChargeResult { verdicts, repeated, left, strategy })
     }
@@ -232,7 +232,7 @@ fn has_written(call: &Call, reply: &Reply) -> bool {
         Script::Open => true,
         Script::Balance => false,
         Script::OpenLeases | Script::Settle => !reply.fields.is_empty(),
-        Script::Charge => reply.numbers.iter().any(|number| *number < KNOWN),
+        Script::Charge => reply.numbers.iter().any(|number| *number < KNOWN_OFFSET),
     }
 }
 

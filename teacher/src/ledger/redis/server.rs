@@ -65,9 +65,9 @@ type RawReply = (Vec<Option<String>>, Vec<u64>, Vec<u64>);
 /// Properties of a server.
 pub(super) struct ServerProperties {
     pub(super) n_accounts: u64,
-    /// Whether it writes an append-only file.
+    /// True if it writes an append-only file.
     pub(super) has_append_only_file: bool,
-    /// Whether it evicts keys when it runs out of memory.
+    /// True if it evicts keys when it runs out of memory.
     pub(super) evicts_keys: bool,
 }
 
