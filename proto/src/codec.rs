@@ -15,8 +15,8 @@ const MAX_PARTS: usize = 65_536;
 
 /// Decodes requests of type `U` and encodes responses of type `T`, as Protobuf.
 ///
-/// A malformed request, or one of too many parts, is the client's error, so the status is `INVALID_ARGUMENT`. Clients use `ProstCodec`, which
-/// reports a malformed response as `INTERNAL`.
+/// A malformed request, or one of too many parts, is the client's error, so the status is `INVALID_ARGUMENT`. Clients
+/// use `ProstCodec`, which reports a malformed response as `INTERNAL`.
 #[derive(Debug)]
 pub(crate) struct RequestCodec<T, U>(PhantomData<(T, U)>);
 

@@ -290,8 +290,8 @@ impl Advisor {
         }
     }
 
-    /// Refuses to answer by another strategy than the account has: a server has lost the account, and another teacher has
-    /// opened it anew. The repeated request is answered by the account's strategy.
+    /// Refuses to answer by another strategy than the account has: a server has lost the account, and another teacher
+    /// has opened it anew. The repeated request is answered by the account's strategy.
     fn check_strategy(
         &mut self,
         scored: &ScoredRequest<'_>,

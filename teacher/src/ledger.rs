@@ -111,8 +111,8 @@ pub trait Ledger: Send {
         None
     }
 
-    /// Returns true if nothing more can be written until another process opens the ledger, which then has every answered
-    /// charge.
+    /// Returns true if nothing more can be written until another process opens the ledger, which then has every
+    /// answered charge.
     fn needs_restart(&self) -> bool {
         false
     }

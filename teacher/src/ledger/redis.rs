@@ -5,12 +5,13 @@
 //! it. A script may be run again if its reply was lost.
 //!
 //! Durability depends on the server. With an append-only file a killed server loses next to nothing. A power cut may
-//! lose the last second (`appendfsync everysec`; with `always`, nothing), and a failover the operations that the replica
-//! has not received. Unlike [`super::SqliteLedger`], which may lose charges only, the server may lose any operation:
+//! lose the last second (`appendfsync everysec`; with `always`, nothing), and a failover the operations that the
+//! replica has not received. Unlike [`super::SqliteLedger`], which may lose charges only, the server may lose any
+//! operation:
 //!
 //! - An account is unknown then. A learner opens it anew, with the units that its learned episodes leave.
-//! - An episode whose lease is lost spends units that are left, in the order of arrival, and may exceed its lease. Advice
-//!   then depends on timing.
+//! - An episode whose lease is lost spends units that are left, in the order of arrival, and may exceed its lease.
+//!   Advice then depends on timing.
 //! - Units of a settlement that is lost stay leased, and no other episode can spend them.
 //! - Lost charges have the consequences that [`super::SqliteLedger`] documents.
 //!

@@ -188,7 +188,8 @@ impl JobLoop {
         self.end()
     }
 
-    /// Runs as [`Self::run`] does, on the runtime of the calls: requests of one simulated moment are answered in one batch.
+    /// Runs as [`Self::run`] does, on the runtime of the calls: requests of one simulated moment are answered in one
+    /// batch.
     async fn run_as_task(mut self) -> Result<(), Error> {
         while let Some(job) = self.jobs.recv().await {
             self.execute(job);
