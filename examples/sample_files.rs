@@ -10,7 +10,7 @@ use prost_reflect::{
     DescriptorPool, DynamicMessage, FieldDescriptor, Kind, MessageDescriptor, Value,
 };
 use serde_json::json;
-use tandem_teacher::budget::{AccountTerms, Charge};
+use tandem_teacher::budget::{AccountTerms, BudgetHalves, Charge};
 use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 
 type AnyError = Box<dyn std::error::Error>;
@@ -33,19 +33,12 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
     ledger.open("unleased", AccountTerms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
     ledger.open("leased", AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
     ledger.open_leases("leased", &[0, 1], 50)?;
-    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted| ChargeRequest {
+    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted_in| ChargeRequest {
         episode_steps: 50,
         account: account.to_owned(),
-        charges: steps
-            .map(|step| Charge {
-                episode,
-                step,
-                wanted_in_first_half: wanted,
-                wanted_in_second_half: wanted,
-            })
-            .collect(),
+        charges: steps.map(|step| Charge { episode, step, wanted_in }).collect(),
     };
-    let (always, never) = (true, false);
+    let (always, never) = (BudgetHalves::BOTH, BudgetHalves::NONE);
     for bill in [
         charges("unleased", 3, 0..12, always),
         charges("leased", 0, 0..20, always),

@@ -23,6 +23,7 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoRe
 
 SERVICE = "tandem.v1.Teacher"
 ARMS = 2
+TS2C_THRESHOLD = "0.1"  # The T of ts2c:T is for the student, which decides on which steps to ask.
 DEADLINE_S = 10
 TRY_AGAIN = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.INTERNAL}
 
@@ -105,9 +106,11 @@ def random_steps(about, episode, n_steps):
 
 
 def reason(strategy, arm):
-    """Returns the strategy's comparison for one arm. The arm is overridden if the left side is larger."""
+    """Returns the strategy's rule for one arm. With a threshold, the arm is overridden if the left side is larger."""
     name, _, threshold = strategy.partition(":")
-    if name == "mc-q":
+    if name == "ts2c":
+        threshold = TS2C_THRESHOLD
+    if name in ("mc-q", "rlif", "ts2c"):
         return f"importance {arm.importance:+.4f}, threshold {threshold}"
     if name == "mc-act":
         return f"distance {arm.distance:.4f}, threshold {threshold}"
@@ -116,7 +119,10 @@ def reason(strategy, arm):
         return f"distance {arm.distance:.4f}, threshold {radius:.4f} ({threshold} of the teacher's action's length)"
     if name == "eamc":
         return f"importance {arm.importance:+.4f}, threshold {threshold} in the budget's second half, none in its first"
-    return f"importance {arm.importance:+.4f}, distance {arm.distance:.4f}, {strategy}: no threshold"
+    scores = f"importance {arm.importance:+.4f}, distance {arm.distance:.4f}"
+    if name == "jsrl":
+        return f"{scores}, {strategy}: overridden on the first {threshold} steps"
+    return f"{scores}, {strategy}: no threshold"
 
 
 def show(strategy, answer):

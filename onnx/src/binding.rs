@@ -15,7 +15,7 @@ use crate::network::{Input, Network};
 /// Largest number of arms that [`layout_of`] considers.
 const MAX_ARMS: usize = 8;
 
-/// What a network computes.
+/// The function that a network computes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// Actions from observations and goals.
@@ -24,7 +24,7 @@ pub enum Role {
     Critic,
 }
 
-/// Where a column of a network comes from. The number is an index in a row of the layout's vector.
+/// The origin of a column of a network. The number is an index in a row of the layout's vector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Source {
     /// A number of the observation.

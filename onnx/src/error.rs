@@ -32,7 +32,7 @@ pub enum ModelError {
     /// The file is larger, or has more parts, than a policy can have.
     #[error("it has {got} {what}, expected at most {most}")]
     TooLarge {
-        /// What is counted.
+        /// The parts that are counted.
         what: &'static str,
         /// Its number.
         got: usize,
@@ -49,7 +49,7 @@ pub enum ModelError {
         node: String,
         /// The node's operator.
         operator: String,
-        /// What is not supported, and what is.
+        /// The property that is not supported, and the supported ones.
         problem: String,
     },
     /// A tensor is not supported.
@@ -57,7 +57,7 @@ pub enum ModelError {
     Tensor {
         /// The tensor's name.
         tensor: String,
-        /// What is not supported, and what is.
+        /// The property that is not supported, and the supported ones.
         problem: String,
     },
     /// An input or output of the model does not fit the layout or the role.
@@ -67,7 +67,7 @@ pub enum ModelError {
         kind: &'static str,
         /// The value's name.
         name: String,
-        /// What is wrong, and what is expected.
+        /// The fault, and the expected value.
         problem: String,
     },
     /// The network is valid, but a policy file cannot represent it.

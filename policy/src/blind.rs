@@ -69,10 +69,10 @@ impl BlindActor {
         let views = self.observations.chunks_exact_mut(layout.n_observation());
         for (arm_idx, view) in views.enumerate() {
             let part = |arm| layout.observation_of(arm);
-            write_view(layout, arm_idx, part, (observation, &self.mean_observation), view);
+            write_view(layout, arm_idx, part, observation, &self.mean_observation, view);
         }
         for (arm_idx, view) in self.goals.chunks_exact_mut(layout.n_goal()).enumerate() {
-            write_view(layout, arm_idx, |arm| layout.goal_of(arm), (goal, &self.mean_goal), view);
+            write_view(layout, arm_idx, |arm| layout.goal_of(arm), goal, &self.mean_goal, view);
         }
         self.actor.act(&self.observations, &self.goals, &mut self.actions);
         let mut chosen = self.actions.chunks_exact(layout.n_action());
@@ -91,7 +91,8 @@ fn write_view<'a>(
     layout: &TaskSpec,
     arm_idx: usize,
     part_of: impl Fn(tandem_core::ArmIndex) -> &'a Part,
-    (vector, mean): (&[f32], &[f32]),
+    vector: &[f32],
+    mean: &[f32],
     view: &mut [f32],
 ) {
     view.copy_from_slice(vector);

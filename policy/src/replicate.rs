@@ -35,15 +35,16 @@ impl Policy {
         let mut actor = vec![0.0; actor_shape.n_parameters()];
         let mut critic = vec![0.0; critic_shape.n_parameters()];
         for arm in layout.arms() {
+            let first_hidden = arm.0 * self.n_hidden;
             let inputs = state_columns(layout, arm);
             let actions: Vec<usize> = layout.action_of(arm).iter().collect();
             let n_state = layout.n_observation() + layout.n_goal();
             let joined: Vec<usize> =
                 inputs.iter().copied().chain(actions.iter().map(|i| n_state + i)).collect();
-            let source = (&self.actor_shape(), self.actor.as_slice());
-            write_block(source, (&actor_shape, &mut actor), (&inputs, &actions), arm);
-            let source = (&self.critic_shape(), self.critic.as_slice());
-            write_block(source, (&critic_shape, &mut critic), (&joined, &[arm.0]), arm);
+            let block = Block { first_hidden, inputs: &inputs, outputs: &actions };
+            block.write(&self.actor_shape(), &self.actor, &actor_shape, &mut actor);
+            let block = Block { first_hidden, inputs: &joined, outputs: &[arm.0] };
+            block.write(&self.critic_shape(), &self.critic, &critic_shape, &mut critic);
         }
         let observations = layout.arms().map(|arm| layout.observation_of(arm));
         let goals = layout.arms().map(|arm| layout.goal_of(arm));
@@ -67,28 +68,40 @@ fn state_columns(layout: &TaskSpec, arm: ArmIndex) -> Vec<usize> {
     layout.observation_of(arm).iter().chain(goals).collect()
 }
 
-/// Writes a network into another one as the block of `arm`. `inputs` are the columns of its inputs in the first layer,
-/// `outputs` the rows of its outputs in the last one.
-fn write_block(
-    (source_shape, source): (&MlpShape, &[f32]),
-    (shape, parameters): (&MlpShape, &mut [f32]),
-    (inputs, outputs): (&[usize], &[usize]),
-    arm: ArmIndex,
-) {
-    let first_hidden = arm.0 * source_shape.n_hidden;
-    let hidden: Vec<usize> = (first_hidden..first_hidden + source_shape.n_hidden).collect();
-    for layer in 0..shape.n_layers() {
-        let columns = if layer == 0 { inputs } else { &hidden };
-        let rows = if layer == shape.n_hidden_layers { outputs } else { &hidden };
-        let (weight, bias) = (shape.weight(layer), shape.bias(layer));
-        let source_rows = source[source_shape.weight(layer)].chunks_exact(columns.len());
-        let source_biases = &source[source_shape.bias(layer)];
-        for ((row, numbers), offset) in rows.iter().zip(source_rows).zip(source_biases) {
-            let start = weight.start + row * shape.layer_input(layer);
-            for (column, number) in columns.iter().zip(numbers) {
-                parameters[start + column] = *number;
+/// The place of a network in one that is wider.
+struct Block<'a> {
+    /// Its first unit in each hidden layer.
+    first_hidden: usize,
+    /// The columns of its inputs in the first layer.
+    inputs: &'a [usize],
+    /// The rows of its outputs in the last layer.
+    outputs: &'a [usize],
+}
+
+impl Block<'_> {
+    /// Writes the parameters `source` of a network of shape `source_shape` into those of the wider one.
+    fn write(
+        &self,
+        source_shape: &MlpShape,
+        source: &[f32],
+        shape: &MlpShape,
+        parameters: &mut [f32],
+    ) {
+        let hidden: Vec<usize> =
+            (self.first_hidden..self.first_hidden + source_shape.n_hidden).collect();
+        for layer in 0..shape.n_layers() {
+            let columns = if layer == 0 { self.inputs } else { &hidden };
+            let rows = if layer == shape.n_hidden_layers { self.outputs } else { &hidden };
+            let (weight, bias) = (shape.weight(layer), shape.bias(layer));
+            let source_rows = source[source_shape.weight(layer)].chunks_exact(columns.len());
+            let source_biases = &source[source_shape.bias(layer)];
+            for ((row, numbers), offset) in rows.iter().zip(source_rows).zip(source_biases) {
+                let start = weight.start + row * shape.layer_input(layer);
+                for (column, number) in columns.iter().zip(numbers) {
+                    parameters[start + column] = *number;
+                }
+                parameters[bias.start + row] = *offset;
             }
-            parameters[bias.start + row] = *offset;
         }
     }
 }

@@ -206,7 +206,7 @@ class Account:
     leased: int
     left: int
     warning: str
-    """The reason why the teacher's ledger cannot be written; empty if it can."""
+    """The reason why the teacher's ledger cannot be written or its policy cannot be evaluated; empty if both can."""
 
 
 class Teacher(_Client):

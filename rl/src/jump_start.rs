@@ -5,7 +5,8 @@
 //! window of training episodes without advice, and never rises again. (Uchendu et al. lower it by a fixed step whenever
 //! the success of teacher and student together is within a tolerance of the best; a student that does not improve then
 //! costs the full horizon for good.) These episodes explore and so succeed less often than evaluations: the horizon is
-//! 0 at a rate of 0.7 already. If all episodes are advised, all of them count.
+//! 0 at a rate of 0.7 already. Late in a run, some of them may be played without exploration
+//! (`rounds.final_greedy_share`); they count like the others. If all episodes are advised, all of them count.
 //!
 //! Pure: the horizon of a round depends on the episodes of the rounds up to the one before the previous round. So it is
 //! known when the round is ordered, with `rounds.lag` 0 and 1, and again when a run resumes.

@@ -196,7 +196,8 @@ impl RunProcesses {
     }
 
     /// Asks all processes to exit and waits for them. The learner, which saves its state, has until `deadline`. The
-    /// teacher, which settles the learner's leases, ends after it. Returns whether the learner has saved its state.
+    /// teacher, which the learner may still call, ends after it. The leases of a round that was ordered in advance stay
+    /// open. Returns whether the learner has saved its state.
     pub(crate) async fn end(&mut self, deadline: Duration) -> Saved {
         let mut learner = None;
         let mut teacher = None;

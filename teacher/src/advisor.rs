@@ -8,9 +8,9 @@ use tandem_core::task::MAX_ARMS;
 use tandem_core::{ArmAdvice, StepAdvice, StepQuery, TaskSpec};
 use tandem_proto::DecodeError;
 
-use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease};
+use crate::budget::{AccountTerms, Balance, BudgetError, BudgetHalf, BudgetHalves, Charge, Lease};
 use crate::error::Error;
-use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError};
+use crate::ledger::{ChargeRequest, ChargeResult, Ledger, LedgerError, printable};
 use crate::maps::Maps;
 use crate::policy::AnyPolicy;
 use crate::strategy::{Strategy, procedure};
@@ -28,7 +28,9 @@ pub struct Advisor {
     strategies: BTreeMap<String, Strategy>,
     /// Accounts for which a step was asked about again with other numbers, so that each gets one warning.
     reused: BTreeSet<String>,
-    /// Whether the service ends when the ledger must be opened again.
+    /// The reason why the latest batch could not be evaluated, if it could not.
+    policy_failure: Option<String>,
+    /// True if the service ends when the ledger must be opened again.
     ends_for_restart: bool,
 }
 
@@ -41,7 +43,7 @@ pub struct TeacherInfo {
     pub students: Vec<TaskSpec>,
     /// The digest of the policy.
     pub digest: String,
-    /// Whether the policy values actions.
+    /// True if the policy values actions.
     pub has_values: bool,
     /// The maps from a student's vectors to each arm's.
     pub maps: Maps,
@@ -92,6 +94,7 @@ impl Advisor {
             ledger,
             strategies: BTreeMap::new(),
             reused: BTreeSet::new(),
+            policy_failure: None,
             ends_for_restart: false,
         })
     }
@@ -103,7 +106,7 @@ impl Advisor {
         Self { ends_for_restart: true, ..self }
     }
 
-    /// Returns whether the service must end, because the ledger must be opened again.
+    /// Returns true if the service must end, because the ledger must be opened again.
     pub(crate) fn must_end(&self) -> bool {
         self.ends_for_restart && self.ledger.needs_restart()
     }
@@ -135,10 +138,11 @@ impl Advisor {
         Ok(self.ledger.balance(name)?)
     }
 
-    /// Returns the reason why the ledger could not be written, if the last attempt failed.
+    /// Returns the reason why the ledger could not be written, if the last attempt failed, or else the reason why the
+    /// policy could not be evaluated, if the last attempt failed.
     #[must_use]
     pub fn warning(&self) -> Option<&str> {
-        self.ledger.warning()
+        self.ledger.warning().or(self.policy_failure.as_deref())
     }
 
     /// Reserves units of account `name` for `episodes`, in their order; see [`Account::open_leases`].
@@ -191,11 +195,16 @@ impl Advisor {
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
                 let balance = self.ledger.balance(&scored.request.account);
-                balance
-                    .map(|balance| ChargeResult { left: balance.left, ..ChargeResult::default() })
+                balance.map(|balance| ChargeResult {
+                    verdicts: Vec::new(),
+                    repeated: Vec::new(),
+                    left: balance.left,
+                    strategy: balance.terms.strategy,
+                })
             } else {
                 charged.next().expect("one result for each request")
             };
+            let charged = charged.and_then(|charged| self.check_strategy(&scored, charged));
             scored.into_advice(&self.info, charged)
         };
         scored.into_iter().map(|scored| answer(scored?)).collect()
@@ -210,7 +219,9 @@ impl Advisor {
             requests.iter().map(|request| self.strategy(&request.account)).collect();
         let open = requests.iter().zip(&strategies).filter(|(_, strategy)| strategy.is_ok());
         let queries = open.flat_map(|(request, _)| &request.queries);
-        let mut arms = self.inference.score(&self.info.maps, queries).into_iter();
+        let scores = self.inference.score(&self.info.maps, queries);
+        self.note_failure(&scores);
+        let mut arms = scores.into_iter();
         let mut score = |request: &'a AdviceRequest, strategy| {
             let arms: Vec<_> = arms.by_ref().take(request.queries.len()).collect();
             let arms = arms.into_iter().collect::<Result<_, _>>()?;
@@ -221,6 +232,15 @@ impl Advisor {
             .zip(strategies)
             .map(|(request, strategy)| score(request, strategy?))
             .collect()
+    }
+
+    /// Stores the first failure among the scores of a batch. A batch without one ends the former failure.
+    fn note_failure(&mut self, scores: &[Result<Vec<ArmAdvice>, Error>]) {
+        if scores.is_empty() {
+            return;
+        }
+        let failure = scores.iter().find_map(|score| score.as_ref().err());
+        self.policy_failure = failure.map(|error| printable(&error.to_string()));
     }
 
     fn strategy(&mut self, account: &str) -> Result<Strategy, Error> {
@@ -270,6 +290,22 @@ impl Advisor {
         }
     }
 
+    /// Refuses to answer by another strategy than the account has: a server has lost the account, and another teacher
+    /// has opened it anew. The repeated request is answered by the account's strategy.
+    fn check_strategy(
+        &mut self,
+        scored: &ScoredRequest<'_>,
+        charged: ChargeResult,
+    ) -> Result<ChargeResult, LedgerError> {
+        if charged.strategy == scored.strategy {
+            return Ok(charged);
+        }
+        let account = &scored.request.account;
+        self.strategies.remove(account);
+        let what = format!("account {account:?} now has strategy {}: ask again", charged.strategy);
+        Err(LedgerError::Unavailable { what, source: None })
+    }
+
     /// Warns, once for each account, if a step was charged that the strategy would not charge now: the account remembers
     /// the verdict on an earlier request for the same step of the same episode, which had other numbers.
     fn warn_of_reused_steps(
@@ -281,7 +317,7 @@ impl Advisor {
             let Ok(result) = result else { continue };
             let mut decided = request.charges.iter().zip(&result.verdicts);
             let is_contradicted = |(charge, verdict): &(&Charge, &Option<BudgetHalf>)| {
-                verdict.is_some_and(|half| !charge.is_wanted_in(half))
+                verdict.is_some_and(|half| !charge.wanted_in.contains(half))
             };
             let Some((charge, _)) = decided.find(is_contradicted) else { continue };
             if self.reused.len() < MAX_CACHED_STRATEGIES
@@ -314,19 +350,17 @@ impl ScoredRequest<'_> {
         for ((query, arms), charge_idx) in
             self.request.queries.iter().zip(&self.arms).zip(charge_indices(&self.request.queries))
         {
-            let wanted = |half| overrides_any(self.strategy, (half, query.step), arms);
-            let (first, second) = (wanted(BudgetHalf::First), wanted(BudgetHalf::Second));
+            let wanted = |half| {
+                procedure(self.strategy, half, query.step)
+                    .is_some_and(|procedure| arms.iter().any(|arm| procedure.overrides(arm)))
+            };
+            let wanted_in = BudgetHalves {
+                first: wanted(BudgetHalf::First),
+                second: wanted(BudgetHalf::Second),
+            };
             match charges.get_mut(charge_idx) {
-                Some(charge) => {
-                    charge.wanted_in_first_half |= first;
-                    charge.wanted_in_second_half |= second;
-                }
-                None => charges.push(Charge {
-                    episode: query.payer.unwrap_or(query.episode),
-                    step: query.step,
-                    wanted_in_first_half: first,
-                    wanted_in_second_half: second,
-                }),
+                Some(charge) => charge.wanted_in = charge.wanted_in.union(wanted_in),
+                None => charges.push(Charge { episode: payer(query), step: query.step, wanted_in }),
             }
         }
         let account = || self.request.account.clone();
@@ -356,19 +390,19 @@ impl ScoredRequest<'_> {
 
 /// Returns the index of each query's charge. Charges are in the order of their first query.
 fn charge_indices(queries: &[StepQuery]) -> Vec<usize> {
-    let mut shared: BTreeMap<(u64, u32), usize> = BTreeMap::new();
-    let mut n_charges = 0;
-    let mut next = || {
-        n_charges += 1;
-        n_charges - 1
-    };
+    let mut by_step: BTreeMap<(u64, u32), usize> = BTreeMap::new();
     queries
         .iter()
-        .map(|query| match query.payer {
-            Some(payer) => *shared.entry((payer, query.step)).or_insert_with(&mut next),
-            None => next(),
+        .map(|query| {
+            let next = by_step.len();
+            *by_step.entry((payer(query), query.step)).or_insert(next)
         })
         .collect()
+}
+
+/// Returns the number of the episode that pays for the step.
+fn payer(query: &StepQuery) -> u64 {
+    query.payer.unwrap_or(query.episode)
 }
 
 /// Overrides the arms that the strategy selects, if a unit was charged for the step.
@@ -379,9 +413,11 @@ fn step_advice(
     mut arms: Vec<ArmAdvice>,
     verdict: Option<BudgetHalf>,
 ) -> StepAdvice {
-    if let Some(half) = verdict {
+    if let Some(half) = verdict
+        && let Some(procedure) = procedure(strategy, half, query.step)
+    {
         for arm in &mut arms {
-            arm.overridden = overrides(strategy, (half, query.step), arm);
+            arm.overridden = procedure.overrides(arm);
         }
     }
     let action = compose(maps, &query.proposed_action, &arms);
@@ -394,14 +430,6 @@ fn compose(maps: &Maps, proposed_action: &[f32], arms: &[ArmAdvice]) -> Vec<f32>
         if arm.overridden { arm.teacher_action.as_slice() } else { map.arm_action(proposed_action) }
     });
     maps.joint_action(proposed_action.len(), chosen)
-}
-
-fn overrides(strategy: Strategy, (half, step): (BudgetHalf, u32), arm: &ArmAdvice) -> bool {
-    procedure(strategy, half, step).is_some_and(|procedure| procedure.overrides(arm))
-}
-
-fn overrides_any(strategy: Strategy, at: (BudgetHalf, u32), arms: &[ArmAdvice]) -> bool {
-    arms.iter().any(|arm| overrides(strategy, at, arm))
 }
 
 fn episode_steps(task: &TaskSpec) -> u32 {

@@ -53,27 +53,46 @@ pub struct Lease {
     pub early_units: u32,
 }
 
-/// One step that may cost a unit, with the halves of the budget in which the strategy would override an arm.
+/// Some of the halves of a budget.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BudgetHalves {
+    /// True if the first half is among them.
+    pub first: bool,
+    /// True if the second half is among them.
+    pub second: bool,
+}
+
+impl BudgetHalves {
+    /// Neither half.
+    pub const NONE: Self = Self { first: false, second: false };
+    /// Both halves.
+    pub const BOTH: Self = Self { first: true, second: true };
+
+    /// Returns true if `half` is among them.
+    #[must_use]
+    pub const fn contains(self, half: BudgetHalf) -> bool {
+        match half {
+            BudgetHalf::First => self.first,
+            BudgetHalf::Second => self.second,
+        }
+    }
+
+    /// Returns the halves that are among these or among `others`.
+    #[must_use]
+    pub const fn union(self, others: Self) -> Self {
+        Self { first: self.first || others.first, second: self.second || others.second }
+    }
+}
+
+/// One step that may cost a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Charge {
     /// The episode's number.
     pub episode: u64,
     /// The step, from 0.
     pub step: u32,
-    /// Whether the step is worth a unit of the first half.
-    pub wanted_in_first_half: bool,
-    /// Whether the step is worth a unit of the second half.
-    pub wanted_in_second_half: bool,
-}
-
-impl Charge {
-    /// Returns true if the step is charged when its unit comes from `half` of the budget.
-    pub(crate) const fn is_wanted_in(&self, half: BudgetHalf) -> bool {
-        match half {
-            BudgetHalf::First => self.wanted_in_first_half,
-            BudgetHalf::Second => self.wanted_in_second_half,
-        }
-    }
+    /// The halves of the budget in which the strategy would override an arm, so that the step is worth a unit.
+    pub wanted_in: BudgetHalves,
 }
 
 /// The reason why an account cannot be opened or used.

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use crate::budget::{
     AccountTerms, Balance, BudgetError, BudgetHalf, Charge, Lease, MAX_BUDGET, Transaction,
 };
+use crate::strategy::Strategy;
 
 pub use memory::MemoryLedger;
 pub use redis::RedisLedger;
@@ -30,14 +31,17 @@ pub struct ChargeRequest {
 }
 
 /// The answer to a [`ChargeRequest`].
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ChargeResult {
     /// The verdict on each charge: the half of the budget whose unit the step cost, or `None` if it cost nothing.
     pub verdicts: Vec<Option<BudgetHalf>>,
-    /// Whether each verdict is that of an earlier charge for the same step.
+    /// For each charge, true if its verdict is that of an earlier charge for the same step.
     pub repeated: Vec<bool>,
     /// Units that are neither spent nor leased after the charges.
     pub left: u64,
+    /// The strategy of the account. It is not the one that callers know if a server has lost the account and another
+    /// teacher has opened it anew.
+    pub strategy: Strategy,
 }
 
 /// The reason why a ledger refuses an operation.
@@ -107,8 +111,8 @@ pub trait Ledger: Send {
         None
     }
 
-    /// Returns whether nothing more can be written until another process opens the ledger, which then has every answered
-    /// charge.
+    /// Returns true if nothing more can be written until another process opens the ledger, which then has every
+    /// answered charge.
     fn needs_restart(&self) -> bool {
         false
     }
@@ -244,10 +248,11 @@ fn charge_all(
     let charged =
         charges.iter().map(|charge| (account.has_verdict(*charge), account.charge(*charge)));
     let (repeated, verdicts) = charged.unzip();
-    Ok(ChargeResult { verdicts, repeated, left: account.left() })
+    let strategy = account.terms().strategy;
+    Ok(ChargeResult { verdicts, repeated, left: account.left(), strategy })
 }
 
-/// Returns whether the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
+/// Returns true if the step lies beyond the end of an episode with a lease. Episodes of a run have leases and
 /// `episode_steps` steps; other episodes may have any length.
 fn is_beyond_end(account: &Transaction<'_>, charge: &Charge, episode_steps: u32) -> bool {
     charge.step >= episode_steps && account.has_lease(charge.episode)
@@ -262,7 +267,7 @@ fn cause(source: Option<&(dyn std::error::Error + Send + Sync)>) -> String {
 const MAX_SHOWN_CHARS: usize = 300;
 
 /// Returns the beginning of a text from a file or a server, on one line and with control characters escaped.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     let mut shown = String::new();
     for character in text.chars().take(MAX_SHOWN_CHARS) {
         match character {

@@ -14,16 +14,11 @@
 //! The first three are pure. The crate does not depend on the student's network, its learning or its simulator.
 //!
 //! ```
-//! use tandem_teacher::budget::{Account, AccountTerms, BudgetHalf, Charge};
+//! use tandem_teacher::budget::{Account, AccountTerms, BudgetHalf, BudgetHalves, Charge};
 //!
 //! let terms = AccountTerms { budget: 2, strategy: "eamc:0.1".parse()? };
 //! let mut account = Account::new(terms);
-//! let step = |step| Charge {
-//!     episode: 7,
-//!     step,
-//!     wanted_in_first_half: true,
-//!     wanted_in_second_half: true,
-//! };
+//! let step = |step| Charge { episode: 7, step, wanted_in: BudgetHalves::BOTH };
 //! assert_eq!(account.charge(step(0)), Some(BudgetHalf::First));
 //! assert_eq!(account.charge(step(1)), Some(BudgetHalf::Second));
 //! assert_eq!(account.charge(step(2)), None, "the budget is spent");

@@ -66,7 +66,7 @@ impl AnyPolicy {
         }
     }
 
-    /// Returns whether the policy values actions.
+    /// Returns true if the policy values actions.
     #[must_use]
     pub fn has_values(&self) -> bool {
         match self {
@@ -176,6 +176,7 @@ impl OneArmPolicy {
         if n_values != 1 {
             return Err(Error::NotOneValue { policy: name, n_values });
         }
+        policy.check()?;
         Ok(Self {
             digest: policy.digest(),
             has_critic: policy.has_critic(),
@@ -268,5 +269,13 @@ mod tests {
             refusal(1, 2),
             "a teacher needs a critic that returns 1 value, that of this one returns 2"
         );
+    }
+
+    #[test]
+    fn an_invalid_policy_is_refused() {
+        let mut short = policy(1, 1, 0.5);
+        short.critic.pop();
+        let refused = OneArmPolicy::new(&short).err().unwrap();
+        assert!(matches!(refused, Error::Policy(_)), "{refused:?}");
     }
 }

@@ -38,7 +38,7 @@ pub enum ActionFilter {
 }
 
 impl Procedure {
-    /// Returns whether the teacher's action replaces the student's on an arm with these scores.
+    /// Returns true if the teacher's action replaces the student's on an arm with these scores.
     #[must_use]
     pub fn overrides(self, arm: &ArmAdvice) -> bool {
         match self {

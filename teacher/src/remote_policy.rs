@@ -162,7 +162,7 @@ impl RemotePolicy {
         &self.description.digest
     }
 
-    /// Returns whether the policy values actions.
+    /// Returns true if the policy values actions.
     #[must_use]
     pub const fn has_values(&self) -> bool {
         self.description.has_values

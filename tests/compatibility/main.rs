@@ -10,7 +10,7 @@ use serde_json::Value;
 use tandem_core::{Layout, Task};
 use tandem_policy::Policy;
 use tandem_report::Run;
-use tandem_teacher::budget::Charge;
+use tandem_teacher::budget::{BudgetHalves, Charge};
 use tandem_teacher::ledger::{ChargeRequest, Ledger as _, SqliteLedger};
 use tandem_telemetry::{read_episode, read_trials, recover};
 use tempfile::TempDir;
@@ -85,12 +85,7 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
         assert_eq!(balance("unleased"), ("mc-q:0.1".to_owned(), 10, 0, 0));
         assert_eq!(balance("leased"), ("eamc:0.25".to_owned(), 25, 45, 930));
         // A charged step is not charged again. The next step is charged to the open lease.
-        let charge = |step| Charge {
-            episode: 1,
-            step,
-            wanted_in_first_half: true,
-            wanted_in_second_half: true,
-        };
+        let charge = |step| Charge { episode: 1, step, wanted_in: BudgetHalves::BOTH };
         let charges = vec![charge(4), charge(5)];
         let request = ChargeRequest { account: "leased".to_owned(), episode_steps: 50, charges };
         ledger.charge(&[request]).remove(0).expect("charged");

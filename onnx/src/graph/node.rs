@@ -243,7 +243,8 @@ fn binary<'a>(interpreter: &mut Interpreter<'a>, node: &'a NodeProto) -> Interpr
 fn mat_mul<'a>(interpreter: &mut Interpreter<'a>, node: &'a NodeProto) -> Interpreted<'a> {
     let rows = rows_of(interpreter, node, 0)?;
     let weight = constant_of(interpreter, node, 1)?;
-    layer(interpreter, node, rows, (weight, 1.0), (None, 1.0))
+    let weight = ScaledInput { constant: weight, factor: 1.0 };
+    layer(interpreter, node, rows, weight, ScaledInput { constant: None, factor: 1.0 })
 }
 
 fn gemm<'a>(interpreter: &mut Interpreter<'a>, node: &'a NodeProto) -> Interpreted<'a> {
@@ -257,19 +258,27 @@ fn gemm<'a>(interpreter: &mut Interpreter<'a>, node: &'a NodeProto) -> Interpret
         _ => weight.map(Constant::transposed),
     };
     let bias = constant_of(interpreter, node, 2)?;
-    let (alpha, beta) = (float(node, "alpha", 1.0), float(node, "beta", 1.0));
-    layer(interpreter, node, rows, (weight, alpha), (bias, beta))
+    let weight = ScaledInput { constant: weight, factor: float(node, "alpha", 1.0) };
+    let bias = ScaledInput { constant: bias, factor: float(node, "beta", 1.0) };
+    layer(interpreter, node, rows, weight, bias)
+}
+
+/// A constant input of a node, if it is there, and the factor by which the node multiplies it.
+#[derive(Debug, Clone, Copy)]
+struct ScaledInput<'a> {
+    constant: Option<Constant<'a>>,
+    factor: f32,
 }
 
 fn layer<'a>(
     interpreter: &mut Interpreter<'a>,
     node: &'a NodeProto,
     rows: Value<'a>,
-    (weight, alpha): (Option<Constant<'a>>, f32),
-    (bias, beta): (Option<Constant<'a>>, f32),
+    weight: ScaledInput<'a>,
+    bias: ScaledInput<'a>,
 ) -> Interpreted<'a> {
-    let weight = weight.ok_or_else(|| node.refused("input 2 is missing"))?;
-    let [n_in, n_out] = weight.matrix_shape()?;
+    let matrix = weight.constant.ok_or_else(|| node.refused("input 2 is missing"))?;
+    let [n_in, n_out] = matrix.matrix_shape()?;
     if n_in != width(&rows) {
         let got = width(&rows);
         return Err(node.refused(format!("its rows have {got} numbers, its weight takes {n_in}")));
@@ -283,9 +292,9 @@ fn layer<'a>(
         let is_finite = numbers.iter().all(|number| number.is_finite());
         is_finite.then_some(numbers).ok_or_else(|| node.refused("alpha or beta is too large"))
     };
-    let weight = scaled(weight.matrix()?, alpha)?;
-    let bias = match bias {
-        Some(bias) => scaled(bias.row(n_out)?, beta)?,
+    let weight = scaled(matrix.matrix()?, weight.factor)?;
+    let bias = match bias.constant {
+        Some(row) => scaled(row.row(n_out)?, bias.factor)?,
         None => vec![0.0; n_out],
     };
     Ok(interpreter.layer(rows, Layer { weight, bias }))

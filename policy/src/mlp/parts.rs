@@ -19,7 +19,7 @@ const TILE: usize = 6;
 const MAX_TILES: usize = 6;
 /// Width from which on a block has at most `MAX_TILES` tiles. In narrower networks, which compute less per row, it has
 /// more.
-const BROAD: usize = 256;
+const BROAD_WIDTH: usize = 256;
 /// Most tiles of a product that reads its operands in place.
 const MAX_UNPACKED_TILES: usize = 8;
 /// Numbers of a block of elementwise work.
@@ -27,7 +27,7 @@ const ELEMENTWISE_BLOCK: usize = 1 << 15;
 
 /// Returns the most tiles of a block whose rows, or columns, have `width` inputs.
 fn max_tiles(width: usize) -> usize {
-    (MAX_TILES * BROAD / width.min(BROAD)).min(MAX_UNPACKED_TILES)
+    (MAX_TILES * BROAD_WIDTH / width.min(BROAD_WIDTH)).min(MAX_UNPACKED_TILES)
 }
 
 /// Splits `0..n` into blocks of about equal size, of at most `max_tiles` tiles each, at multiples of a tile.

@@ -11,12 +11,15 @@ use crate::procedures::score_arm;
 /// The teacher's policy with the buffers of a batch.
 pub(super) struct TeacherInference {
     policy: AnyPolicy,
+    /// The length of an action of one arm.
+    n_action: usize,
     batch: Batch,
 }
 
 impl TeacherInference {
     pub(super) fn new(policy: AnyPolicy) -> Self {
-        Self { policy, batch: Batch::default() }
+        let n_action = policy.layout().n_action();
+        Self { policy, n_action, batch: Batch::default() }
     }
 
     /// Scores each arm of each of `queries`, with nothing overridden. Returns one result for each query.
@@ -66,11 +69,10 @@ impl TeacherInference {
     }
 
     fn score_row(&self, row: usize) -> ArmAdvice {
-        let n_action = self.policy.layout().n_action();
         let (teacher_actions, student_actions) =
             self.batch.actions.split_at(self.batch.actions.len() / 2);
         let (q_teacher, q_student) = self.batch.q.split_at(self.batch.q.len() / 2);
-        let action = row * n_action..(row + 1) * n_action;
+        let action = row * self.n_action..(row + 1) * self.n_action;
         let (teacher, student) = (&teacher_actions[action.clone()], &student_actions[action]);
         score_arm(teacher, student, q_teacher[row], q_student[row])
     }

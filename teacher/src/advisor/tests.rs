@@ -82,6 +82,15 @@ fn a_lost_account_is_judged_by_the_strategy_with_which_it_is_opened_anew() {
     advise(&mut advisor, "run", &[two_arms(0)]).unwrap_err();
     advisor.ledger.open("run", terms("mc-q:0.25")).unwrap();
     assert_eq!(ask(&mut advisor, &two_arms(0)).overridden_arms(), 0b00);
+
+    // Another teacher opens it before this one has noticed that it was lost.
+    advisor.ledger = Box::new(MemoryLedger::default());
+    advisor.ledger.open("run", terms("mc-q:0.0625")).unwrap();
+    let refused = advise(&mut advisor, "run", &[two_arms(0)]).unwrap_err().to_string();
+    let expected =
+        "the ledger cannot be used now: account \"run\" now has strategy mc-q:0.0625: ask again";
+    assert_eq!(refused, expected);
+    assert_eq!(ask(&mut advisor, &two_arms(1)).overridden_arms(), 0b01);
 }
 
 #[test]
@@ -213,6 +222,19 @@ fn queries_of_one_payer_and_step_share_a_unit() {
 }
 
 #[test]
+fn a_query_without_payer_shares_the_unit_of_queries_that_name_its_episode() {
+    let near = query(1, 0, 0.0, 0.0);
+    let far = query(1, 0, 0.5, 0.25);
+    let paid_by_it = StepQuery { episode: 2, payer: Some(1), ..far.clone() };
+    for queries in [[near.clone(), paid_by_it.clone()], [paid_by_it, near.clone()], [near, far]] {
+        let advice = advise(&mut advisor(10, "mc-act:0.1"), "run", &queries).unwrap();
+        let charged: Vec<bool> = advice.steps.iter().map(|step| step.charged).collect();
+        assert_eq!((charged, advice.budget_left), (vec![true; 2], 9), "{queries:?}");
+        assert!(advice.steps.iter().all(|step| !step.repeated), "one decision for both");
+    }
+}
+
+#[test]
 fn one_request_may_hold_students_of_several_layouts() {
     let mut advisor = advisor(10, "ea");
     let three_arms = StepQuery {
@@ -304,6 +326,21 @@ fn a_refused_request_does_not_affect_the_others_of_its_batch() {
     ];
     assert_eq!(outcomes, expected);
     assert_eq!(advisor.balance("run").unwrap().spent, 3, "steps 0, 1 and 7");
+}
+
+#[test]
+fn a_policy_that_fails_is_a_warning_until_it_succeeds() {
+    let mut advisor = Advisor::new(Box::new(Broken), Box::new(MemoryLedger::default())).unwrap();
+    let terms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
+    advisor.open_account("run", terms).unwrap();
+    let failing = query(1, 4, 0.95, 0.0);
+    let failure = advise(&mut advisor, "run", &[two_arms(0), failing]).unwrap_err().to_string();
+    assert!(failure.contains("not finite for step 4 of episode 1"), "{failure}");
+    assert_eq!(advisor.warning(), Some(failure.as_str()));
+    advise(&mut advisor, "run", &[]).unwrap();
+    assert_eq!(advisor.warning(), Some(failure.as_str()), "nothing was evaluated");
+    ask(&mut advisor, &two_arms(1));
+    assert_eq!(advisor.warning(), None);
 }
 
 /// Returns requests of several accounts and sizes, some of them for the same steps.

@@ -27,7 +27,7 @@ pub(crate) struct LeaseRecord {
     pub(crate) early_units: u32,
     /// Units charged to the episode before it had the lease.
     pub(crate) charged_before: u64,
-    /// Whether the unspent units were returned to the budget.
+    /// True after the unspent units were returned to the budget.
     pub(crate) settled: bool,
 }
 

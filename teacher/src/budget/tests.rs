@@ -6,15 +6,15 @@ use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
 use super::*;
 use crate::strategy::Strategy;
 
-/// Whether a step is worth a unit of the first and of the second half of the budget.
+/// True if a step is worth a unit of the first, and of the second half of the budget.
 type Wanted = [bool; 2];
 
 const ALWAYS: Wanted = [true, true];
 const NEVER: Wanted = [false, false];
 
 fn charge(episode: u64, step: u32, wanted: Wanted) -> Charge {
-    let [wanted_in_first_half, wanted_in_second_half] = wanted;
-    Charge { episode, step, wanted_in_first_half, wanted_in_second_half }
+    let [first, second] = wanted;
+    Charge { episode, step, wanted_in: BudgetHalves { first, second } }
 }
 
 fn account(budget: u64) -> Account {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::account::{Account, LeaseRecord};
 use super::verdict_bits::{VerdictBits, VerdictIndex, charged_units, verdict_index};
-use super::{BudgetHalf, Charge, Lease};
+use super::{AccountTerms, BudgetHalf, Charge, Lease};
 
 /// A series of operations on an account. Each operation sees the changes of those before it; the account itself stays
 /// as it is until [`Account::apply`]. A ledger in a file writes the changes before it applies them.
@@ -28,7 +28,7 @@ pub(crate) struct Changes {
 }
 
 impl Changes {
-    /// Returns whether no record has changed.
+    /// Returns true if no record has changed.
     pub(crate) fn is_empty(&self) -> bool {
         self.leases.is_empty() && self.verdicts.is_empty()
     }
@@ -51,12 +51,17 @@ impl<'a> Transaction<'a> {
         self.changes
     }
 
+    /// Returns the budget and the strategy of the account.
+    pub(crate) const fn terms(&self) -> AccountTerms {
+        self.account.terms()
+    }
+
     /// Returns the units that are neither spent nor leased.
     pub(crate) const fn left(&self) -> u64 {
         self.account.terms().budget - self.assigned()
     }
 
-    /// Returns whether units were ever reserved for `episode`.
+    /// Returns true if units were ever reserved for `episode`.
     pub(crate) fn has_lease(&self, episode: u64) -> bool {
         self.lease(episode).is_some()
     }
@@ -89,7 +94,7 @@ impl<'a> Transaction<'a> {
         }
     }
 
-    /// Returns whether there is a verdict on the step of `charge`.
+    /// Returns true if there is a verdict on the step of `charge`.
     pub(crate) fn has_verdict(&self, charge: Charge) -> bool {
         let bits = self.verdicts_at(verdict_index(charge.episode, charge.step));
         bits.is_some_and(|bits| bits.get(charge.step).is_some())
@@ -103,7 +108,7 @@ impl<'a> Transaction<'a> {
         if let Some(verdict) = bits.get(step) {
             return verdict;
         }
-        let verdict = self.next_unit(episode).filter(|half| charge.is_wanted_in(*half));
+        let verdict = self.next_unit(episode).filter(|half| charge.wanted_in.contains(*half));
         if verdict.is_some() {
             self.spend_unit(episode);
         }

@@ -36,7 +36,7 @@ pub(super) fn charged_units(
 }
 
 impl VerdictBits {
-    /// Returns whether each charged step was asked about, and each step of the first half was charged.
+    /// Returns true if each charged step was asked about, and each step of the first half was charged.
     pub(crate) const fn is_consistent(self) -> bool {
         self.charged & !self.asked == 0 && self.first_half & !self.charged == 0
     }

@@ -60,7 +60,7 @@ impl Ledger for MemoryLedger {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::{Charge, MAX_BUDGET};
+    use crate::budget::{BudgetHalves, Charge, MAX_BUDGET};
     use crate::strategy::Strategy;
 
     const TERMS: AccountTerms = AccountTerms { budget: 10, strategy: Strategy::EarlyAdvising };
@@ -70,8 +70,7 @@ mod tests {
         let mut ledger = MemoryLedger::default();
         let fresh = Balance { terms: TERMS, spent: 0, leased: 0, left: 10 };
         assert_eq!(ledger.open("run", TERMS).unwrap(), fresh);
-        let charge =
-            Charge { episode: 1, step: 0, wanted_in_first_half: true, wanted_in_second_half: true };
+        let charge = Charge { episode: 1, step: 0, wanted_in: BudgetHalves::BOTH };
         let request =
             ChargeRequest { account: "run".to_owned(), episode_steps: 50, charges: vec![charge] };
         assert_eq!(ledger.charge(&[request]).remove(0).unwrap().left, 9);

@@ -4,10 +4,18 @@
 //! account have one hash tag. [`crate::budget::Account`] defines the scripts in `redis/`; the tests compare them with
 //! it. A script may be run again if its reply was lost.
 //!
-//! Durability depends on the server. With an append-only file a killed server loses next to nothing; a power cut or a
-//! failover to a replica may lose the last second (`appendfsync everysec`). The consequences are those that
-//! [`super::SqliteLedger`] documents for lost charges. Without an append-only file everything since the last snapshot
-//! is lost, and the ledger logs a warning.
+//! Durability depends on the server. With an append-only file a killed server loses next to nothing. A power cut may
+//! lose the last second (`appendfsync everysec`; with `always`, nothing), and a failover the operations that the
+//! replica has not received. Unlike [`super::SqliteLedger`], which may lose charges only, the server may lose any
+//! operation:
+//!
+//! - An account is unknown then. A learner opens it anew, with the units that its learned episodes leave.
+//! - An episode whose lease is lost spends units that are left, in the order of arrival, and may exceed its lease.
+//!   Advice then depends on timing.
+//! - Units of a settlement that is lost stay leased, and no other episode can spend them.
+//! - Lost charges have the consequences that [`super::SqliteLedger`] documents.
+//!
+//! Without an append-only file everything since the last snapshot is lost, and the ledger logs a warning.
 
 mod server;
 
@@ -21,13 +29,15 @@ use server::{Call, Reply, Script, Server};
 
 /// Steps whose verdicts share a field of the hash.
 const STEPS_PER_FIELD: u32 = 64;
-/// What the script adds to a verdict that it found.
-const KNOWN: u64 = 10;
+/// The number that the script adds to a verdict that it found.
+const KNOWN_OFFSET: u64 = 10;
 
 /// A ledger on a Redis server.
 #[derive(Debug)]
 pub struct RedisLedger {
     server: Server,
+    /// The reason why the last script that writes failed, if it did.
+    warning: Option<String>,
 }
 
 impl RedisLedger {
@@ -55,17 +65,48 @@ impl RedisLedger {
                 "the server drops keys when its memory is full: set its maxmemory-policy to noeviction"
             );
         }
-        Ok(Self { server })
+        Ok(Self { server, warning: None })
     }
 
     /// Runs one script.
     fn call(&mut self, call: Call) -> Result<Reply, LedgerError> {
-        let mut replies = self.calls(&[call])?;
+        let replies = self.calls(&[call]);
+        let mut replies = replies.map_err(|error| self.unavailable(error))?;
         replies.pop().ok_or_else(|| self.invalid("no reply"))
     }
 
-    fn calls(&mut self, calls: &[Call]) -> Result<Vec<Reply>, LedgerError> {
-        self.server.run(calls).map_err(|error| self.unavailable(error))
+    /// Runs scripts, and stores the failure of those that write as the warning. A script that had nothing to write says
+    /// nothing about the next one.
+    fn calls(&mut self, calls: &[Call]) -> Result<Vec<Reply>, redis::RedisError> {
+        let outcome = self.server.run(calls);
+        match &outcome {
+            Ok(replies) => {
+                if calls.iter().zip(replies).any(|(call, reply)| has_written(call, reply)) {
+                    self.report(None);
+                }
+            }
+            Err(error) => {
+                if calls.iter().any(|call| call.script() != Script::Balance) {
+                    self.report(Some(error));
+                }
+            }
+        }
+        outcome
+    }
+
+    /// Stores the outcome of scripts that write as the warning, and logs when it differs from the previous one.
+    fn report(&mut self, error: Option<&redis::RedisError>) {
+        let name = self.server.name();
+        let of = |error: &redis::RedisError| {
+            format!("cannot write {name}: {}", printable(&error.to_string()))
+        };
+        let warning = error.map(of);
+        match (&self.warning, &warning) {
+            (None, Some(warning)) => tracing::error!("nothing can be charged: {warning}"),
+            (Some(_), None) => tracing::info!(ledger = name, "the ledger can be written again"),
+            _ => {}
+        }
+        self.warning = warning;
     }
 
     fn unavailable(&self, error: redis::RedisError) -> LedgerError {
@@ -100,7 +141,7 @@ impl RedisLedger {
             let charge_idx = usize::try_from(*charge_idx).unwrap_or(usize::MAX);
             return Err(LedgerError::BeyondEnd { charge_idx });
         }
-        let verdict = |number: &u64| match number % KNOWN {
+        let verdict = |number: &u64| match number % KNOWN_OFFSET {
             0 => Ok(None),
             1 => Ok(Some(BudgetHalf::First)),
             2 => Ok(Some(BudgetHalf::Second)),
@@ -110,8 +151,9 @@ impl RedisLedger {
         if verdicts.len() != request.charges.len() {
             return Err(self.invalid("not one verdict for each charge"));
         }
-        let repeated = reply.numbers.iter().map(|number| *number >= KNOWN).collect();
-        Ok(ChargeResult { verdicts, repeated, left: balance.left })
+        let repeated = reply.numbers.iter().map(|number| *number >= KNOWN_OFFSET).collect();
+        let Balance { terms: AccountTerms { strategy, .. }, left, .. } = balance;
+        Ok(ChargeResult { verdicts, repeated, left, strategy })
     }
 
     /// Returns the error for a reply or a value that no ledger writes.
@@ -168,7 +210,7 @@ impl Ledger for RedisLedger {
 
     fn charge(&mut self, requests: &[ChargeRequest]) -> Vec<Result<ChargeResult, LedgerError>> {
         let calls: Vec<Call> = requests.iter().map(charge_call).collect();
-        match self.server.run(&calls) {
+        match self.calls(&calls) {
             Ok(replies) => {
                 let answered = requests.iter().zip(&replies);
                 answered.map(|(request, reply)| self.charge_result(request, reply)).collect()
@@ -179,16 +221,30 @@ impl Ledger for RedisLedger {
             }
         }
     }
+
+    fn warning(&self) -> Option<&str> {
+        self.warning.as_deref()
+    }
+}
+
+/// Returns true if the script of `call` has written something before it replied.
+fn has_written(call: &Call, reply: &Reply) -> bool {
+    match call.script() {
+        Script::Open => true,
+        Script::Balance => false,
+        Script::OpenLeases | Script::Settle => !reply.fields.is_empty(),
+        Script::Charge => reply.numbers.iter().any(|number| *number < KNOWN_OFFSET),
+    }
 }
 
 /// Encodes the arguments of `redis/charge.lua`.
 fn charge_call(request: &ChargeRequest) -> Call {
     let mut call = Call::new(Script::Charge, &request.account);
     for charge in &request.charges {
-        let Charge { episode, step, .. } = charge;
+        let Charge { episode, step, wanted_in } = charge;
         let digit = |yes: bool| if yes { '1' } else { '0' };
-        let first = digit(charge.wanted_in_first_half);
-        let second = digit(charge.wanted_in_second_half);
+        let first = digit(wanted_in.first);
+        let second = digit(wanted_in.second);
         call = call
             .arg(episode)
             .arg(format_args!("{episode}:{}", step / STEPS_PER_FIELD))

@@ -51,7 +51,7 @@ impl OnnxPolicy {
         Ok(Self { digest, names_task, actor: bound, critic: Some(critic) })
     }
 
-    /// Returns whether the actor's metadata names the task. Otherwise it is the one that the vectors fit.
+    /// Returns true if the actor's metadata names the task. Otherwise it is the one that the vectors fit.
     #[must_use]
     pub const fn names_task(&self) -> bool {
         self.names_task

@@ -177,6 +177,8 @@ async fn an_absent_policy_charges_nothing_and_the_repeated_request_is_decided_as
     assert_eq!(reason, "restarting");
     assert!(server.n_calls.load(Ordering::Relaxed) > 1, "the call is repeated");
     assert_eq!(spent(&mut advisor), 0);
+    let warning = advisor.warning().unwrap();
+    assert!(warning.ends_with(" does not answer: restarting"), "{warning}");
 
     server.is_away.store(false, Ordering::Relaxed);
     let (mut advisor, advice) = outside(move || {
@@ -185,7 +187,7 @@ async fn an_absent_policy_charges_nothing_and_the_repeated_request_is_decided_as
     })
     .await;
     assert!(advice.steps[0].charged);
-    assert_eq!(spent(&mut advisor), 1);
+    assert_eq!((spent(&mut advisor), advisor.warning()), (1, None));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]

@@ -11,7 +11,7 @@ use crate::error::Error;
 /// The metrics of requests for advice.
 #[derive(Debug, Clone)]
 pub(super) struct TeacherMetrics {
-    pub(super) metrics: Metrics,
+    pub(super) registry: Metrics,
     request_seconds: Histogram,
     batch_seconds: Histogram,
     batch_steps: Histogram,
@@ -36,7 +36,7 @@ impl TeacherMetrics {
         let batch_steps =
             metrics.histogram("advice_batch_steps", "Steps that one batch answers", &COUNT_BUCKETS);
         Self {
-            metrics: metrics.clone(),
+            registry: metrics.clone(),
             request_seconds,
             batch_seconds,
             batch_steps,
@@ -48,9 +48,14 @@ impl TeacherMetrics {
         }
     }
 
+    /// Returns the time since the start.
+    pub(super) fn now(&self) -> Duration {
+        self.registry.now()
+    }
+
     /// Records a request that arrived at `start`.
     pub(super) fn record_request(&self, start: Duration) {
-        self.metrics.observe_since(&self.request_seconds, start);
+        self.registry.observe_since(&self.request_seconds, start);
     }
 
     /// Records the answers to a batch of `n_steps` that was begun at `start`.
@@ -60,7 +65,7 @@ impl TeacherMetrics {
         n_steps: usize,
         answers: &[Result<Advice, Error>],
     ) {
-        self.metrics.observe_since(&self.batch_seconds, start);
+        self.registry.observe_since(&self.batch_seconds, start);
         self.batch_steps.observe(n_steps as f64);
         let (mut n_answered, mut n_overridden, mut n_charged) = (0, 0, 0);
         for step in answers.iter().flatten().flat_map(|advice| &advice.steps) {

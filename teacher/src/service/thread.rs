@@ -73,20 +73,21 @@ impl AdvisorThread {
     ) -> io::Result<(Self, AdvisorHandle)> {
         let (jobs, queue) = mpsc::channel(QUEUE_CAPACITY);
         add_queue_depth(&metrics, &jobs);
-        let batch = Batch::new(metrics.clone(), timeout);
         let (end_sender, ended) = oneshot::channel();
         let info = Arc::new(advisor.info().clone());
-        let end_signal = EndSignal { _stop: stop.clone().drop_guard(), _ended: end_sender };
+        let batch = Batch::new(metrics.clone(), timeout);
+        let job_loop = JobLoop { advisor, jobs: queue, batch, stop: stop.clone() };
+        let end_signal = EndSignal { _stop: stop.drop_guard(), _ended: end_sender };
         let handle = match pacing {
             Pacing::Concurrent => JoinHandle::Thread(
                 thread::Builder::new().name("advisor".to_owned()).spawn(move || {
                     let _end_signal = end_signal;
-                    run_thread(advisor, queue, batch, &stop)
+                    job_loop.run()
                 })?,
             ),
             Pacing::Lockstep => JoinHandle::Task(tokio::spawn(async move {
                 let _end_signal = end_signal;
-                run_task(advisor, queue, batch, &stop).await
+                job_loop.run_as_task().await
             })),
         };
         let failures = Arc::default();
@@ -119,14 +120,14 @@ impl AdvisorHandle {
 
     /// Logs the failure of a request, unless many requests have failed alike.
     pub(super) fn record_failure(&self, error: &Error) {
-        self.failures.record(error, self.metrics.metrics.now());
+        self.failures.record(error, self.metrics.now());
     }
 
     /// Answers a request for advice. If the future is dropped before the thread has taken the request, nothing is
     /// charged.
     pub(super) async fn advise(&self, request: AdviceRequest) -> Answer<Advice> {
         let (reply, answer) = oneshot::channel();
-        let start = self.metrics.metrics.now();
+        let start = self.metrics.now();
         let advice = self.send(Job::Advise(request, start, reply), answer).await;
         self.metrics.record_request(start);
         advice
@@ -160,7 +161,7 @@ impl AdvisorHandle {
 /// Adds the number of waiting jobs to the metrics, while there are senders of jobs.
 fn add_queue_depth(metrics: &TeacherMetrics, jobs: &mpsc::Sender<Job>) {
     let jobs = jobs.downgrade();
-    metrics.metrics.add_source(move |registry| {
+    metrics.registry.add_source(move |registry| {
         let depth = jobs.upgrade().map_or(0, |jobs| jobs.max_capacity() - jobs.capacity());
         let help = "Jobs that wait for the advising thread";
         registry.register("advice_queue_depth", help, ConstGauge::new(depth as f64));
@@ -171,39 +172,44 @@ fn add_queue_depth(metrics: &TeacherMetrics, jobs: &mpsc::Sender<Job>) {
 }
 
 /// Executes jobs in their order. Requests that wait together are answered in one batch.
-fn run_thread(
-    mut advisor: Advisor,
-    mut jobs: mpsc::Receiver<Job>,
-    mut batch: Batch,
-    stop: &CancellationToken,
-) -> Result<(), Error> {
-    while let Some(job) = jobs.blocking_recv() {
-        batch.take_all(job, &mut jobs, &mut advisor);
-        batch.answer(&mut advisor);
-        if advisor.must_end() {
-            // The service ends; until then, calls are refused.
-            stop.cancel();
-        }
-    }
-    if advisor.must_end() { Err(Error::LedgerNeedsRestart) } else { Ok(()) }
+struct JobLoop {
+    advisor: Advisor,
+    jobs: mpsc::Receiver<Job>,
+    batch: Batch,
+    stop: CancellationToken,
 }
 
-/// As [`run_thread`], on the runtime of the calls: requests of one simulated moment are answered in one batch.
-async fn run_task(
-    mut advisor: Advisor,
-    mut jobs: mpsc::Receiver<Job>,
-    mut batch: Batch,
-    stop: &CancellationToken,
-) -> Result<(), Error> {
-    while let Some(job) = jobs.recv().await {
-        batch.take_all(job, &mut jobs, &mut advisor);
-        batch.answer(&mut advisor);
-        if advisor.must_end() {
+impl JobLoop {
+    /// Runs until there are no senders of jobs, on a thread of its own.
+    fn run(mut self) -> Result<(), Error> {
+        while let Some(job) = self.jobs.blocking_recv() {
+            self.execute(job);
+        }
+        self.end()
+    }
+
+    /// Runs as [`Self::run`] does, on the runtime of the calls: requests of one simulated moment are answered in one
+    /// batch.
+    async fn run_as_task(mut self) -> Result<(), Error> {
+        while let Some(job) = self.jobs.recv().await {
+            self.execute(job);
+        }
+        self.end()
+    }
+
+    /// Executes `job` and those that wait behind it.
+    fn execute(&mut self, job: Job) {
+        self.batch.take_all(job, &mut self.jobs, &mut self.advisor);
+        self.batch.answer(&mut self.advisor);
+        if self.advisor.must_end() {
             // The service ends; until then, calls are refused.
-            stop.cancel();
+            self.stop.cancel();
         }
     }
-    if advisor.must_end() { Err(Error::LedgerNeedsRestart) } else { Ok(()) }
+
+    fn end(self) -> Result<(), Error> {
+        if self.advisor.must_end() { Err(Error::LedgerNeedsRestart) } else { Ok(()) }
+    }
 }
 
 /// Requests that are answered together.
@@ -217,7 +223,7 @@ struct Batch {
     metrics: TeacherMetrics,
 }
 
-/// What the latest batch says about the next one.
+/// The size and the time of the next batch, by the measure of the latest one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Pace {
     /// The number of steps at which a batch takes no further request.
@@ -227,7 +233,7 @@ struct Pace {
 }
 
 impl Pace {
-    /// As long as nothing is known.
+    /// The pace before the first batch.
     const FAST: Self = Self { max_steps: MAX_BATCH_STEPS, batch_time: Duration::ZERO };
 
     /// Returns the pace after a batch of `n_steps` steps, at least 1, has taken `time`; a call may take `timeout`.
@@ -243,7 +249,7 @@ impl Pace {
         Self { max_steps, batch_time: time }
     }
 
-    /// Returns whether a request that has waited for `waited` is not worth an answer: its caller would be gone before
+    /// Returns true if a request that has waited for `waited` is not worth an answer: its caller would be gone before
     /// the batch ends. Some requests are always worth one, so that the pace is measured again.
     fn is_too_late(self, waited: Duration, timeout: Duration) -> bool {
         waited + self.batch_time.min(timeout / 2) > timeout
@@ -278,7 +284,7 @@ impl Batch {
         match job {
             Job::Advise(_, _, reply) if reply.is_closed() => {}
             Job::Advise(request, since, reply) => {
-                let waited = self.metrics.metrics.now().saturating_sub(since);
+                let waited = self.metrics.now().saturating_sub(since);
                 if self.pace.is_too_late(waited, self.timeout) {
                     // A caller that has gone repeats its request anyway.
                     drop(reply.send(Err(Error::Timeout(self.timeout))));
@@ -299,10 +305,10 @@ impl Batch {
         if self.requests.is_empty() {
             return;
         }
-        let start = self.metrics.metrics.now();
+        let start = self.metrics.now();
         let answers = advisor.advise(&self.requests);
         if self.n_steps > 0 {
-            let time = self.metrics.metrics.now().saturating_sub(start);
+            let time = self.metrics.now().saturating_sub(start);
             self.pace = Pace::after(self.n_steps, time, self.timeout);
         }
         self.metrics.record_batch(start, self.n_steps, &answers);

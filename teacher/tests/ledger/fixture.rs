@@ -1,13 +1,13 @@
 //! A ledger of any kind, with shorthands for operations on it.
 
-use tandem_teacher::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
+use tandem_teacher::budget::{AccountTerms, Balance, BudgetHalf, BudgetHalves, Charge, Lease};
 use tandem_teacher::ledger::{ChargeRequest, ChargeResult, Ledger, MemoryLedger};
 use tandem_teacher::{Strategy, ledger};
 use tempfile::TempDir;
 
 use crate::ledger_tests::redis_server::RedisServer;
 
-/// Whether a step is worth a unit of the first and of the second half of the budget.
+/// True if a step is worth a unit of the first, and of the second half of the budget.
 pub(crate) type Wanted = [bool; 2];
 pub(crate) type Verdict = Option<BudgetHalf>;
 
@@ -104,17 +104,14 @@ pub(crate) fn request(account: &str, charges: &[Charge]) -> ChargeRequest {
 }
 
 pub(crate) fn charge(episode: u64, step: u32, wanted: Wanted) -> Charge {
-    let [wanted_in_first_half, wanted_in_second_half] = wanted;
-    Charge { episode, step, wanted_in_first_half, wanted_in_second_half }
+    let [first, second] = wanted;
+    Charge { episode, step, wanted_in: BudgetHalves { first, second } }
 }
 
 /// Returns a charge for the same step that wants a unit exactly of the other halves.
 pub(crate) fn inverted(charge: &Charge) -> Charge {
-    Charge {
-        wanted_in_first_half: !charge.wanted_in_first_half,
-        wanted_in_second_half: !charge.wanted_in_second_half,
-        ..*charge
-    }
+    let BudgetHalves { first, second } = charge.wanted_in;
+    Charge { wanted_in: BudgetHalves { first: !first, second: !second }, ..*charge }
 }
 
 pub(crate) fn lease(episode: u64, units: u32, early_units: u32) -> Lease {

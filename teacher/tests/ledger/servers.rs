@@ -195,6 +195,44 @@ fn a_server_that_may_forget_is_warned_about() {
 }
 
 #[test]
+fn a_server_that_refuses_writes_is_warned_about_until_it_accepts_them() {
+    let Some(server) = RedisServer::start() else { return };
+    let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");
+    ledger.open("run", terms(10)).expect("an account");
+    let known = [request("run", &[charge(1, 0, BOTH)])];
+    ledger.charge(&known).remove(0).expect("paid");
+    assert_eq!(ledger.warning(), None);
+    let limit_memory = |bytes: u64| {
+        let mut command = redis::cmd("CONFIG");
+        command.arg("SET").arg("maxmemory").arg(bytes);
+        command.exec(&mut server.connection()).expect("set");
+    };
+
+    limit_memory(1);
+    let log = Log::default();
+    let new = [request("run", &[charge(1, 1, BOTH)])];
+    is_unavailable(log.of(|| ledger.charge(&new).remove(0)));
+    let expected = format!("cannot write {}: ", server.url());
+    let warning = ledger.warning().expect("a warning").to_owned();
+    assert!(warning.starts_with(&expected) && warning.contains("maxmemory"), "{warning}");
+    assert!(log.text().contains(&warning), "{}", log.text());
+    // What needs no memory succeeds and proves nothing.
+    assert_eq!(ledger.balance("run").expect("an account").spent, 1);
+    assert!(ledger.charge(&known).remove(0).is_ok());
+    assert_eq!(ledger.warning(), Some(warning.as_str()));
+
+    limit_memory(0);
+    ledger.charge(&new).remove(0).expect("paid");
+    assert_eq!(ledger.warning(), None);
+    limit_memory(1);
+    is_unavailable(ledger.open_leases("run", &[2], 3));
+    assert!(ledger.warning().is_some());
+    limit_memory(0);
+    ledger.open_leases("run", &[2], 3).expect("leases");
+    assert_eq!(ledger.warning(), None);
+}
+
+#[test]
 fn the_keys_of_an_account_have_one_hash_tag_and_can_be_read() {
     let Some(server) = RedisServer::start() else { return };
     let mut ledger = RedisLedger::open(&server.url()).expect("a ledger");

@@ -23,7 +23,7 @@ macro_rules! on_account {
 }
 
 /// An operation on an account.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Script {
     Open,
     Balance,
@@ -65,9 +65,9 @@ type RawReply = (Vec<Option<String>>, Vec<u64>, Vec<u64>);
 /// Properties of a server.
 pub(super) struct ServerProperties {
     pub(super) n_accounts: u64,
-    /// Whether it writes an append-only file.
+    /// True if it writes an append-only file.
     pub(super) has_append_only_file: bool,
-    /// Whether it evicts keys when it runs out of memory.
+    /// True if it evicts keys when it runs out of memory.
     pub(super) evicts_keys: bool,
 }
 
@@ -82,6 +82,10 @@ pub(super) struct Server {
 impl Call {
     pub(super) fn new(script: Script, account: &str) -> Self {
         Self { script, account: account.to_owned(), args: Vec::new() }
+    }
+
+    pub(super) const fn script(&self) -> Script {
+        self.script
     }
 
     pub(super) fn arg(mut self, arg: impl fmt::Display) -> Self {

@@ -76,7 +76,7 @@ impl LedgerFile {
         &self.path
     }
 
-    /// Returns whether the log beside the file was displaced. The file itself has every answered charge then.
+    /// Returns true if the log beside the file was displaced. The file itself has every answered charge then.
     pub(super) fn has_lost_log(&self) -> bool {
         self.displaced == Some(Displaced::Log)
     }

@@ -1,7 +1,7 @@
 mod damage;
 
 use super::*;
-use crate::budget::{BudgetHalf, Charge};
+use crate::budget::{BudgetHalf, BudgetHalves, Charge};
 use crate::strategy::Strategy;
 
 const TERMS: AccountTerms = AccountTerms { budget: 100_000, strategy: Strategy::EarlyAdvising };
@@ -14,8 +14,7 @@ fn ledger() -> (tempfile::TempDir, SqliteLedger) {
 }
 
 fn request(account: &str, episode: u64, steps: std::ops::Range<u32>) -> ChargeRequest {
-    let charge =
-        |step| Charge { episode, step, wanted_in_first_half: true, wanted_in_second_half: true };
+    let charge = |step| Charge { episode, step, wanted_in: BudgetHalves::BOTH };
     let charges = steps.map(charge).collect();
     ChargeRequest { account: account.to_owned(), episode_steps: 50, charges }
 }
