@@ -206,7 +206,7 @@ impl TrialRunner {
     }
 
     /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before it
-    /// starts and, where it holds nothing, withdraws at the end.
+    /// starts and, in tasks without grasping, withdraws at the end.
     fn with_withdrawals(&self, waypoints: &[Waypoint], at: &[Joints]) -> Vec<Waypoint> {
         let (Some(first), Some(last)) = (waypoints.first(), waypoints.last()) else {
             return waypoints.to_vec();
