@@ -10,7 +10,7 @@ use crate::trial::shared_object::shared_object;
 use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
 
-/// The smallest gap between two blocks, and between a block and the goal of another one, metres.
+/// The smallest gap between two blocks at the start, and between two blocks at their goals, metres.
 const ROOM_M: f64 = 0.02;
 /// The largest number of starts that are drawn until one has room for the blocks.
 const N_DRAWS: usize = 1000;
