@@ -7,6 +7,7 @@
 use tandem_kinematics::Joints;
 
 use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig, SimulatedPair};
+use crate::trial::closed_loop::ClosedLoop;
 use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{FailureCause, ObjectResult};
 use crate::trial::rehearsal::TrialStart;
@@ -72,7 +73,7 @@ impl TrialRunner {
         let simulated = without_noise(&with_friction(&self.config.simulated, friction));
         let pair = self.pair(start, at, start.number, &simulated);
         let (execution, ends) = self.on(pair, |rig| {
-            let execution = self.closed_loop(rig, start, at, policy);
+            let execution = ClosedLoop::new(self, rig, start, at, policy).run();
             (execution, rig.pair().objects())
         })?;
         let (waypoints, motion) = match execution.ended {

@@ -9,6 +9,7 @@ use tandem_kinematics::{
 use tandem_sim::SimError;
 
 use crate::simulated::{Block, ObjectPose, SimulatedConfig, SimulatedPair, single};
+use crate::trial::closed_loop::ClosedLoop;
 use crate::trial::mapping::Mapping;
 use crate::trial::outcome::{
     FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
@@ -116,7 +117,7 @@ impl TrialRunner {
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
             Some(motion) => self.open_loop(&mut rig, &start, motion),
-            None => self.closed_loop(&mut rig, &start, &at, policy),
+            None => ClosedLoop::new(self, &mut rig, &start, &at, policy).run(),
         };
         Ok(self.report(number, &start, &initial, &rig, execution))
     }

@@ -6,15 +6,12 @@
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
-use tandem_kinematics::Joints;
 
-use super::{DONE_SHARE, LoopState, WantedStep};
+use super::{ClosedLoop, DONE_SHARE, LoopState, WantedStep};
 use crate::simulated::ObjectPose;
-use crate::trial::ActionSource;
 use crate::trial::noise::add_noise;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
-use crate::trial::rig::TrialRig;
 use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
 /// A policy is done after this many consecutive observations of placed objects that stay there.
@@ -37,93 +34,80 @@ enum Turn {
     NextEpisode,
 }
 
-impl TrialRunner {
+impl ClosedLoop<'_, '_> {
     /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
     /// one episode.
-    pub(in crate::trial) fn closed_loop(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        at: &[Joints],
-        policy: &mut dyn ActionSource,
-    ) -> TrialExecution {
-        let mut execution = TrialExecution {
-            ended: Ok(()),
-            n_steps: 0,
-            n_shortened: 0,
+    pub(in crate::trial) fn run(mut self) -> TrialExecution {
+        let ended = self.episodes();
+        self.state.count_success(self.runner.is_success(self.rig, self.start));
+        TrialExecution {
+            ended,
+            n_steps: self.n_steps,
+            n_shortened: self.n_shortened,
             rehearsed_m: None,
-            timed_out: false,
-            n_in_success: 0,
-            waypoints: Vec::new(),
-        };
-        let mut state = LoopState::new(start, at);
-        execution.ended = self.episodes(rig, start, &mut state, policy, &mut execution);
-        state.count_success(self.is_success(rig, start));
-        execution.n_in_success = state.n_in_success;
-        execution.waypoints = state.waypoints;
-        execution
+            timed_out: self.timed_out,
+            n_in_success: self.state.n_in_success,
+            waypoints: self.state.waypoints,
+        }
     }
 
-    fn episodes(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-        policy: &mut dyn ActionSource,
-        execution: &mut TrialExecution,
-    ) -> Result<(), FailureCause> {
-        let time_limit_s = self.config.time_limit_s / self.config.speed;
+    fn episodes(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
+        let shares_object = runner.task.shares_object();
+        let time_limit_s = runner.config.time_limit_s / runner.config.speed;
         let (mut n_in_episode, mut n_blocked) = (0, 0_usize);
-        self.order_arms(rig, start, state)?;
+        self.order_arms()?;
         loop {
-            if state.n_done == DONE_OBSERVATIONS {
-                rig.wait(REST_S)?;
-                if self.task.shares_object()
-                    || !self.misplaced(&rig.observe_objects()?, start).any(|misplaced| misplaced)
+            if self.state.n_done == DONE_OBSERVATIONS {
+                self.rig.wait(REST_S)?;
+                if shares_object
+                    || !runner
+                        .misplaced(&self.rig.observe_objects()?, start)
+                        .any(|misplaced| misplaced)
                 {
                     return Ok(());
                 }
-                state.n_done = 0;
+                self.state.n_done = 0;
             }
-            execution.timed_out = rig.now_s() > time_limit_s;
-            let is_over = n_in_episode == self.task.episode_steps();
-            if execution.timed_out || is_over && self.task.shares_object() {
-                return rig.wait(REST_S);
+            self.timed_out = self.rig.now_s() > time_limit_s;
+            let is_over = n_in_episode == runner.task.episode_steps();
+            if self.timed_out || is_over && shares_object {
+                return self.rig.wait(REST_S);
             }
             if is_over {
-                self.start_next_episode(rig, start, state)?;
+                self.start_next_episode()?;
                 n_in_episode = 0;
             }
-            execution.n_steps += 1;
+            self.n_steps += 1;
             // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
-            if self.step(rig, start, state, policy)? {
+            if self.step()? {
                 n_in_episode += 1;
                 n_blocked = n_blocked.saturating_sub(1);
             } else {
-                execution.n_shortened += 1;
+                self.n_shortened += 1;
                 n_blocked += 1;
             }
-            if self.task.shares_object() {
+            if shares_object {
                 continue;
             }
-            self.nudge(rig, state)?;
-            let is_idle = self.config.layout.task.grasps() && state.progress.is_idle();
+            self.nudge()?;
+            let is_idle = runner.config.layout.task.grasps() && self.state.progress.is_idle();
             let is_blocked = n_blocked == MAX_BLOCKED || is_idle;
             if is_blocked {
                 n_blocked = 0;
-                state.progress.start_again();
+                self.state.progress.start_again();
             }
-            if is_blocked || state.parked.contains(&true) {
-                let objects = rig.observe_objects()?;
-                match self.next_turn(&objects, start, state, is_blocked) {
+            if is_blocked || self.state.parked.contains(&true) {
+                let objects = self.rig.observe_objects()?;
+                match runner.next_turn(&objects, start, &mut self.state, is_blocked) {
                     Turn::Same => {}
                     Turn::Parks(parks) => {
-                        self.retreat(rig, state, &parks)?;
-                        state.parked = parks;
+                        self.retreat(&parks)?;
+                        self.state.parked = parks;
                         n_in_episode = 0;
                     }
                     Turn::NextEpisode => {
-                        self.start_next_episode(rig, start, state)?;
+                        self.start_next_episode()?;
                         n_in_episode = 0;
                     }
                 }
@@ -131,6 +115,50 @@ impl TrialRunner {
         }
     }
 
+    /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
+    fn start_next_episode(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
+        let objects = self.rig.observe_objects()?;
+        let misplaced: Vec<bool> = runner.misplaced(&objects, start).collect();
+        self.retreat(&misplaced)?;
+        self.recall()?;
+        let (seed, state) = (runner.config.seed, &mut self.state);
+        state.parked.fill(false);
+        state.before = None;
+        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
+        self.order_arms()
+    }
+
+    /// Opens the grippers of the `retreating` arms unless they hold an object above the table, raises their hands and
+    /// withdraws them toward their bases, as far as the check allows.
+    pub(super) fn retreat(&mut self, retreating: &[bool]) -> Result<(), FailureCause> {
+        let runner = self.runner;
+        let objects = self.rig.observe_objects()?;
+        let blocks = runner.observed_blocks(&objects, None);
+        let grasps = runner.config.layout.task.grasps();
+        let open_m = if grasps { runner.mapping.max_opening_m() } else { 0.0 };
+        let lifted: Vec<bool> = runner.lying(&objects).map(|lies| !lies).collect();
+        let raised = |hand: DVec3| runner.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
+        let withdrawn = |hand: DVec3| runner.mapping.withdrawn_hand(hand);
+        let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
+        for way in ways {
+            let mut hands = runner.hands(&self.state);
+            let mut openings_m = self.state.openings_m.clone();
+            for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
+                hands[arm] = way(hands[arm]);
+                if !lifted[arm] {
+                    openings_m[arm] = open_m;
+                }
+            }
+            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
+            self.attempt(&wanted, &wanted.hands, &runner.check)?;
+        }
+        self.state.velocities.fill(DVec3::ZERO);
+        Ok(())
+    }
+}
+
+impl TrialRunner {
     /// Decides which arms make way: those whose objects lie at their goals on the table. If there are none and the arms
     /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
     /// the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its turn
@@ -165,23 +193,6 @@ impl TrialRunner {
         }
     }
 
-    /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
-    fn start_next_episode(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-    ) -> Result<(), FailureCause> {
-        let misplaced: Vec<bool> = self.misplaced(&rig.observe_objects()?, start).collect();
-        self.retreat(rig, state, &misplaced)?;
-        self.recall(rig, start, state)?;
-        state.parked.fill(false);
-        state.before = None;
-        let seed = self.config.seed;
-        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
-        self.order_arms(rig, start, state)
-    }
-
     /// Returns the arms that are not parked and whose objects are not `misplaced` and lie on the table.
     fn parking(&self, objects: &[ObjectPose], misplaced: &[bool], state: &LoopState) -> Vec<bool> {
         let parks = misplaced.iter().zip(self.lying(objects)).zip(&state.parked);
@@ -194,38 +205,6 @@ impl TrialRunner {
             let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
             height_m - self.config.trained_half_m < LYING_M
         })
-    }
-
-    /// Opens the grippers of the `retreating` arms unless they hold an object above the table, raises their hands and
-    /// withdraws them toward their bases, as far as the check allows.
-    pub(super) fn retreat(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-        retreating: &[bool],
-    ) -> Result<(), FailureCause> {
-        let objects = rig.observe_objects()?;
-        let blocks = self.observed_blocks(&objects, None);
-        let grasps = self.config.layout.task.grasps();
-        let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
-        let lifted: Vec<bool> = self.lying(&objects).map(|lies| !lies).collect();
-        let raised = |hand: DVec3| self.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
-        let withdrawn = |hand: DVec3| self.mapping.withdrawn_hand(hand);
-        let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
-        for way in ways {
-            let mut hands = self.hands(state);
-            let mut openings_m = state.openings_m.clone();
-            for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
-                hands[arm] = way(hands[arm]);
-                if !lifted[arm] {
-                    openings_m[arm] = open_m;
-                }
-            }
-            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
-            self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
-        }
-        state.velocities.fill(DVec3::ZERO);
-        Ok(())
     }
 
     /// Replaces what the policy wants of parked arms: they stay where they are.

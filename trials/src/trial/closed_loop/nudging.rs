@@ -7,11 +7,11 @@
 use glam::{DQuat, DVec3};
 use tandem_core::ArmIndex;
 
-use super::{LoopState, WantedStep, tool_axes};
+use super::step_motion::tool_axes;
+use super::{ClosedLoop, LoopState, WantedStep};
 use crate::simulated::ObjectPose;
 use crate::trial::block_avoidance::ObservedBlock;
 use crate::trial::outcome::FailureCause;
-use crate::trial::rig::TrialRig;
 use crate::trial::runner::TrialRunner;
 
 /// A hand that has been held up for this many steps in a row pushes its object.
@@ -45,15 +45,12 @@ pub(super) struct Push {
     pub(super) to: DVec3,
 }
 
-impl TrialRunner {
+impl ClosedLoop<'_, '_> {
     /// If a hand has been held up for [`N_HELD_UP`] steps, pushes its object along the neighbouring one, or the neighbour
     /// along its object.
-    pub(super) fn nudge(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-    ) -> Result<(), FailureCause> {
-        if !self.config.layout.task.grasps() || self.task.shares_object() {
+    pub(super) fn nudge(&mut self) -> Result<(), FailureCause> {
+        let (runner, state) = (self.runner, &mut self.state);
+        if !runner.config.layout.task.grasps() || runner.task.shares_object() {
             return Ok(());
         }
         let mut arms = 0..state.at.len();
@@ -61,9 +58,9 @@ impl TrialRunner {
             return Ok(());
         };
         state.progress.release(arm);
-        let objects = rig.observe_objects()?;
-        if let Some(push) = self.push(arm, &objects, state) {
-            self.carry_out(rig, state, arm, &objects, &push)?;
+        let objects = self.rig.observe_objects()?;
+        if let Some(push) = runner.push(arm, &objects, state) {
+            self.carry_out(arm, &objects, &push)?;
         }
         Ok(())
     }
@@ -71,25 +68,24 @@ impl TrialRunner {
     /// Pushes with the closed gripper of `arm`, which comes from above and rises again. An object that it holds is set down
     /// first. Returns whether the hand got to both ends of the push.
     pub(super) fn carry_out(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
+        &mut self,
         arm: usize,
         objects: &[ObjectPose],
         push: &Push,
     ) -> Result<bool, FailureCause> {
+        let runner = self.runner;
         let Push { from, to } = *push;
-        let blocks = self.observed_blocks(objects, None);
-        let above_m = 2.0 * f64::from(self.config.block.half_m) + ABOVE_M;
-        let hand = self.hands(state)[arm];
-        let down = hand.with_z(hand.z.min(self.config.trained_half_m));
+        let blocks = runner.observed_blocks(objects, None);
+        let above_m = 2.0 * f64::from(runner.config.block.half_m) + ABOVE_M;
+        let hand = runner.hands(&self.state)[arm];
+        let down = hand.with_z(hand.z.min(runner.config.trained_half_m));
         let raised = hand.with_z(above_m.min(hand.z + RISE_M));
-        let grasps = self.config.layout.task.grasps();
-        let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
-        if grasps && self.lying(objects).nth(arm) == Some(false) {
-            let holding_m = state.openings_m[arm];
-            self.move_hand(rig, state, arm, (down, holding_m), &blocks)?;
-            self.move_hand(rig, state, arm, (self.hands(state)[arm], open_m), &blocks)?;
+        let grasps = runner.config.layout.task.grasps();
+        let open_m = if grasps { runner.mapping.max_opening_m() } else { 0.0 };
+        if grasps && runner.lying(objects).nth(arm) == Some(false) {
+            let holding_m = self.state.openings_m[arm];
+            self.move_hand(arm, (down, holding_m), &blocks)?;
+            self.move_hand(arm, (runner.hands(&self.state)[arm], open_m), &blocks)?;
         }
         let ways = [
             (raised, open_m),
@@ -100,41 +96,41 @@ impl TrialRunner {
         ];
         let mut arrives = true;
         for (hand, opening_m) in ways {
-            arrives = self.move_hand(rig, state, arm, (hand, opening_m), &blocks)?;
+            arrives = self.move_hand(arm, (hand, opening_m), &blocks)?;
             if !arrives {
                 break;
             }
         }
-        state.velocities.fill(DVec3::ZERO);
+        self.state.velocities.fill(DVec3::ZERO);
         Ok(arrives)
     }
 
     /// Moves the hand of `arm` `to` a position (own frame, metres) with an opening (metres on each side), in parts that the
     /// check of a motion allows. Returns whether the hand is there, rather than above a block or on its way.
     fn move_hand(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
+        &mut self,
         arm: usize,
-        to: (DVec3, f64),
+        (to, opening_m): (DVec3, f64),
         blocks: &[ObservedBlock],
     ) -> Result<bool, FailureCause> {
-        let (to, opening_m) = to;
-        let from = self.hands(state)[arm];
+        let runner = self.runner;
+        let from = runner.hands(&self.state)[arm];
         let n_parts = ((to - from).length() / LONGEST_M).floor() + 1.0;
         for part in (1..=MAX_PARTS).map(f64::from).take_while(|part| *part <= n_parts) {
-            let mut hands = self.hands(state);
-            let mut openings_m = state.openings_m.clone();
+            let mut hands = runner.hands(&self.state);
+            let mut openings_m = self.state.openings_m.clone();
             hands[arm] = from.lerp(to, part / n_parts);
             openings_m[arm] = opening_m;
             let wanted = WantedStep { hands, openings_m, blocks };
-            if !self.attempt(rig, state, &wanted, &wanted.hands, &self.check)? {
+            if !self.attempt(&wanted, &wanted.hands, &runner.check)? {
                 return Ok(false);
             }
         }
-        Ok((self.hands(state)[arm] - to).length() < ARRIVED_M)
+        Ok((runner.hands(&self.state)[arm] - to).length() < ARRIVED_M)
     }
+}
 
+impl TrialRunner {
     /// Returns the push that makes room for the pads of `arm`: of its own object, rather away from the other one than past
     /// it, or else of the other one. There is none if no other object lies beside the arm's own, or if hands cannot reach the
     /// places.

@@ -7,11 +7,8 @@
 use glam::DVec2;
 use tandem_core::ArmIndex;
 
-use super::LoopState;
+use super::ClosedLoop;
 use crate::trial::outcome::FailureCause;
-use crate::trial::rehearsal::TrialStart;
-use crate::trial::rig::TrialRig;
-use crate::trial::runner::TrialRunner;
 
 /// The horizontal distance from the way of an object below which another object is in its way, metres.
 const CLEARANCE_M: f64 = 0.10;
@@ -25,35 +22,31 @@ struct Way {
     to: DVec2,
 }
 
-impl TrialRunner {
+impl ClosedLoop<'_, '_> {
     /// Withdraws and parks the arm whose object is to be pushed last, if the order matters. Its turn comes when the other
     /// object lies at its goal.
-    pub(super) fn order_arms(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-    ) -> Result<(), FailureCause> {
+    pub(super) fn order_arms(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
         // Hands that grasp lift their objects over others.
-        if self.task.shares_object() || self.config.layout.task.grasps() {
+        if runner.task.shares_object() || runner.config.layout.task.grasps() {
             return Ok(());
         }
-        let objects = rig.observe_objects()?;
-        if !self.misplaced(&objects, start).all(|misplaced| misplaced) {
+        let objects = self.rig.observe_objects()?;
+        if !runner.misplaced(&objects, start).all(|misplaced| misplaced) {
             return Ok(());
         }
         let ways = objects.iter().zip(&start.goals).enumerate().map(|(arm, (object, goal))| {
-            let to = self.mapping.object_in_world(ArmIndex(arm), *goal);
+            let to = runner.mapping.object_in_world(ArmIndex(arm), *goal);
             Way { from: object.at_m.truncate(), to: to.truncate() }
         });
         let ways: Vec<Way> = ways.collect();
         let Some(waiting) = waiting_arm(&ways) else { return Ok(()) };
-        let place = self.mapping.withdrawn_hand(self.hands(state)[waiting]);
+        let place = runner.mapping.withdrawn_hand(runner.hands(&self.state)[waiting]);
         let waits: Vec<bool> = (0..ways.len()).map(|arm| arm == waiting).collect();
-        self.retreat(rig, state, &waits)?;
-        state.before = None;
-        if self.hands(state)[waiting].distance(place) < WITHDRAWN_WITHIN_M {
-            state.parked = waits;
+        self.retreat(&waits)?;
+        self.state.before = None;
+        if runner.hands(&self.state)[waiting].distance(place) < WITHDRAWN_WITHIN_M {
+            self.state.parked = waits;
         }
         Ok(())
     }

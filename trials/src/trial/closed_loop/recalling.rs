@@ -7,13 +7,11 @@
 use glam::DVec3;
 use tandem_core::ArmIndex;
 
-use super::LoopState;
+use super::ClosedLoop;
 use super::nudging::{GAP_M, PADS_M, Push};
 use super::sparing::AHEAD_M;
 use crate::simulated::ObjectPose;
 use crate::trial::outcome::FailureCause;
-use crate::trial::rehearsal::TrialStart;
-use crate::trial::rig::TrialRig;
 use crate::trial::runner::TrialRunner;
 
 /// Distance from an object that can be grasped to the edge of the hand's box, metres.
@@ -22,26 +20,22 @@ const EDGE_M: f64 = 0.02;
 const UNIT_M: f64 = 0.01;
 const MAX_UNITS: u32 = 100;
 
-impl TrialRunner {
+impl ClosedLoop<'_, '_> {
     /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to get at
     /// them.
-    pub(super) fn recall(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-    ) -> Result<(), FailureCause> {
-        for owner in self.config.layout.arms() {
-            let objects = rig.observe_objects()?;
-            let is_misplaced = self.misplaced(&objects, start).nth(owner.0) == Some(true);
-            if !is_misplaced || self.lying(&objects).nth(owner.0) != Some(true) {
+    pub(super) fn recall(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
+        for owner in runner.config.layout.arms() {
+            let objects = self.rig.observe_objects()?;
+            let is_misplaced = runner.misplaced(&objects, start).nth(owner.0) == Some(true);
+            if !is_misplaced || runner.lying(&objects).nth(owner.0) != Some(true) {
                 continue;
             }
-            for (arm, push) in self.recalls(owner, &objects, start.goals[owner.0]) {
-                let is_pushed = self.carry_out(rig, state, arm, &objects, &push)?;
-                let mut pushing = vec![false; state.at.len()];
+            for (arm, push) in runner.recalls(owner, &objects, start.goals[owner.0]) {
+                let is_pushed = self.carry_out(arm, &objects, &push)?;
+                let mut pushing = vec![false; self.state.at.len()];
                 pushing[arm] = true;
-                self.retreat(rig, state, &pushing)?;
+                self.retreat(&pushing)?;
                 if is_pushed {
                     break;
                 }
@@ -49,7 +43,9 @@ impl TrialRunner {
         }
         Ok(())
     }
+}
 
+impl TrialRunner {
     /// Returns the pushes that may bring the object of `owner` back, each with the arm that makes it and in its frame, best
     /// first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the hand of
     /// `owner` can get at its object.
