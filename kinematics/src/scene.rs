@@ -126,7 +126,7 @@ mod tests {
             let apart_m = left.centre.iter().zip(right.centre).map(|(a, b)| (a - b).powi(2));
             let expected_m = 2.0 * (opening * 0.062 + 0.005);
             assert!((apart_m.sum::<f32>().sqrt() - expected_m).abs() < 1e-5, "{arm:?}");
-            // The fingers close along the own frame's y.
+            // The fingers close along the arm frame's y.
             assert!((left.centre[0] - right.centre[0]).abs() < 1e-3, "{arm:?}");
         }
         assert!(scene.arms[0].base[0] < scene.arms[1].base[0]);

@@ -153,12 +153,12 @@ fn a_straight_line_uses_some_limit_almost_fully() {
     }
 }
 
-/// Returns waypoints of both arms on a line in their own frames. The grippers are shut from the middle on.
+/// Returns waypoints of both arms on a line in the arm frames. The grippers are shut from the middle on.
 fn line(cell: &WorkCell, from: Point3<f64>, to: Point3<f64>, n: u32) -> Vec<Waypoint> {
     let at = |idx: u32| {
         let share = f64::from(idx) / f64::from(n - 1);
         let waypoint = |arm| ArmWaypoint {
-            tool_in_world_m: cell.world_from_own(ArmIndex(arm), &from.lerp(&to, share)),
+            tool_in_world_m: cell.world_from_arm(ArmIndex(arm), &from.lerp(&to, share)),
             gripper_opening: f64::from(u32::from(2 * idx < n)),
         };
         (0..cell.arms.len()).map(waypoint).collect()

@@ -49,7 +49,7 @@ pub struct SimulatedConfig {
     pub shared: Option<SharedObject>,
 }
 
-/// A gripper with two fingers that slide along y of the arm's own frame.
+/// A gripper with two fingers that slide along y of the arm frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GripperConfig {
     /// Force with which each finger presses, newtons.

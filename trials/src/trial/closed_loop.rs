@@ -46,7 +46,7 @@ pub(super) struct ClosedLoop<'a, 'rig> {
 
 /// What the policy wants in a step, and what is in the way.
 struct WantedStep<'a> {
-    /// The end effectors after the step, own frames, metres.
+    /// The end effectors after the step, arm frames, metres.
     hands: Vec<DVec3>,
     /// The openings after the step, metres on each side.
     openings_m: Vec<f64>,
@@ -59,7 +59,7 @@ struct LoopState {
     at: Vec<Joints>,
     /// The commanded openings, metres on each side.
     openings_m: Vec<f64>,
-    /// The velocities of the training world's hands, own frames, metres per second.
+    /// The velocities of the training world's hands, arm frames, metres per second.
     velocities: Vec<DVec3>,
     before: Option<Vec<ArmObservation>>,
     /// The number of consecutive observations with every object at its goal.
@@ -71,7 +71,7 @@ struct LoopState {
     progress: Progress,
     /// Whether each gripper opens only as wide as its object needs, because another object lies next to it.
     narrow: Vec<bool>,
-    /// By how much each hand is to withdraw from what it presses on, own frames, metres.
+    /// By how much each hand is to withdraw from what it presses on, arm frames, metres.
     withdraw: Option<Vec<DVec3>>,
     /// The arms that stay out of the other arm's way: their objects are at their goals, or they wait for their turn.
     parked: Vec<bool>,

@@ -232,7 +232,7 @@ impl TrialRunner {
             let Ok(solution) = placed.model.inverse_kinematics(&target, &at[arm]) else {
                 return vec![*waypoint; N_WITHDRAWAL_STEPS];
             };
-            let hand = self.mapping.hand_in_own(index, &solution.angles);
+            let hand = self.mapping.hand_in_arm(index, &solution.angles);
             let above = self.mapping.reachable_hand(hand + DVec3::Z * LIFT_M);
             let target = self.mapping.withdrawn_hand(hand);
             let mut last = *waypoint;

@@ -8,7 +8,7 @@ use tandem_bridge::executor::{StartError, Stop};
 
 /// An object that rises by more than this was lifted, metres.
 const LIFTED_M: f64 = 0.03;
-/// An object farther than this from the origin of its arm's own frame, along x or y, is out of reach, metres. In the
+/// An object farther than this from the origin of its arm's frame, along x or y, is out of reach, metres. In the
 /// shared world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
 const REACH_M: f64 = 0.27;
 
@@ -105,7 +105,7 @@ impl FailureCause {
     }
 }
 
-/// The result of one object; own frame of its arm, metres.
+/// The result of one object; frame of its arm, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ObjectResult {
     /// The initial position.

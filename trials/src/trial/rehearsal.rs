@@ -15,7 +15,7 @@ const ROOM_M: f64 = 0.02;
 /// The largest number of starts that are drawn until one has room for the blocks.
 const N_DRAWS: usize = 1000;
 
-/// The start and goals of a trial; own frames, metres.
+/// The start and goals of a trial; arm frames, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialStart {
     /// The number of the trial.
@@ -41,7 +41,7 @@ const FIRST_OPENING: usize = 9;
 /// One step of a rollout, arm by arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RolloutStep {
-    /// The end effectors after the step, own frames, metres.
+    /// The end effectors after the step, arm frames, metres.
     pub hands: Vec<DVec3>,
     /// The openings of the grippers before the step, of each side, metres. A gripper that holds an object is open as
     /// wide as that.

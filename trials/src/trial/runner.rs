@@ -130,14 +130,14 @@ impl TrialRunner {
         rig: &TrialRig<'_>,
         execution: TrialExecution,
     ) -> TrialReport {
-        let own = |arm: usize, at_m: DVec3| self.mapping.object_in_own(ArmIndex(arm), at_m);
+        let in_arm = |arm: usize, at_m: DVec3| self.mapping.object_in_arm(ArmIndex(arm), at_m);
         let ends = rig.pair().objects();
         let objects: Vec<ObjectResult> = (0..ends.len())
             .map(|arm| ObjectResult {
-                start: own(arm, initial[arm].at_m),
+                start: in_arm(arm, initial[arm].at_m),
                 goal: start.goals[arm],
-                end: own(arm, ends[arm].at_m),
-                highest_m: own(arm, DVec3::Z * rig.highest_m[arm]).z,
+                end: in_arm(arm, ends[arm].at_m),
+                highest_m: in_arm(arm, DVec3::Z * rig.highest_m[arm]).z,
             })
             .collect();
         let goals = self.in_world(&start.goals);
@@ -185,7 +185,7 @@ impl TrialRunner {
     /// Returns for each arm the distance from its object to its goal, metres.
     pub(super) fn goal_distances_m(&self, objects: &[ObjectPose], start: &TrialStart) -> Vec<f64> {
         let distance_m = |(arm, (object, goal)): (usize, (&ObjectPose, &DVec3))| {
-            self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal)
+            self.mapping.object_in_arm(ArmIndex(arm), object.at_m).distance(*goal)
         };
         objects.iter().zip(&start.goals).enumerate().map(distance_m).collect()
     }
@@ -222,7 +222,7 @@ impl TrialRunner {
         Ok(motion)
     }
 
-    /// Returns the waypoint for end effectors at `hands` (own frames, metres), near joint angles `near` (radians).
+    /// Returns the waypoint for end effectors at `hands` (arm frames, metres), near joint angles `near` (radians).
     pub(super) fn waypoint(
         &self,
         hands: &[DVec3],
@@ -253,9 +253,11 @@ impl TrialRunner {
         self.rehearsal.start(self.config.seed, number, is_free)
     }
 
-    fn in_world(&self, own: &[DVec3]) -> Vec<DVec3> {
-        let point = |(arm, own): (usize, &DVec3)| self.mapping.object_in_world(ArmIndex(arm), *own);
-        own.iter().enumerate().map(point).collect()
+    /// Converts positions of objects or goals, one of each arm, from the arm frames to the world frame, metres.
+    fn in_world(&self, in_arm: &[DVec3]) -> Vec<DVec3> {
+        let point =
+            |(arm, in_arm): (usize, &DVec3)| self.mapping.object_in_world(ArmIndex(arm), *in_arm);
+        in_arm.iter().enumerate().map(point).collect()
     }
 
     pub(super) fn pair(

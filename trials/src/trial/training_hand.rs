@@ -23,7 +23,7 @@ pub struct TrainingHand {
     acceleration_mps2: f64,
     /// The displacement of an action of 1, metres.
     action_m: f64,
-    /// The workspace of the end effector, own frame: low and high corner, metres.
+    /// The workspace of the end effector, arm frame: low and high corner, metres.
     workspace_m: [DVec3; 2],
     /// The part of the workspace that the arm reaches; all of it if there is none.
     reach: Option<&'static Reach>,
@@ -60,7 +60,7 @@ impl TrainingHand {
     }
 
     /// Returns the position and velocity of the hand after a step with `action` (one arm's, shape `[action_per_arm]`,
-    /// in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    /// in [−1, 1]) from `hand` with `velocity`; arm frame, metres and metres per second.
     ///
     /// # Panics
     /// Panics if the action has fewer than three numbers.
@@ -82,7 +82,7 @@ impl TrainingHand {
         (self.reachable(at), velocity)
     }
 
-    /// Returns the nearest position to `at` that the hand may have; own frame, metres.
+    /// Returns the nearest position to `at` that the hand may have; arm frame, metres.
     #[must_use]
     pub fn reachable(&self, at: DVec3) -> DVec3 {
         let [low, high] = self.workspace_m;

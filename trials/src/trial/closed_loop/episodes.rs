@@ -202,7 +202,7 @@ impl TrialRunner {
     /// Returns for each arm whether its object lies on the table.
     pub(super) fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
         objects.iter().enumerate().map(|(arm, object)| {
-            let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
+            let height_m = self.mapping.object_in_arm(ArmIndex(arm), object.at_m).z;
             height_m - self.config.trained_half_m < LYING_M
         })
     }
@@ -271,8 +271,8 @@ mod tests {
         let mut state = LoopState::new(&start, &at);
         let objects = |distances_m: [f64; 2]| {
             let pose = |(arm, distance_m): (usize, f64)| {
-                let own = start.goals[arm] + DVec3::X * distance_m;
-                let at_m = runner.mapping.object_in_world(ArmIndex(arm), own);
+                let in_arm = start.goals[arm] + DVec3::X * distance_m;
+                let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm);
                 ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
             };
             distances_m.into_iter().enumerate().map(pose).collect::<Vec<_>>()
@@ -310,9 +310,9 @@ mod tests {
         start.goals[0].z = 0.15;
         let at = runner.mapping.cell().ready(0.2).unwrap();
         let mut state = LoopState::new(&start, &at);
-        let own = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
+        let in_arm = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
         let pose = |arm: usize| {
-            let at_m = runner.mapping.object_in_world(ArmIndex(arm), own[arm]);
+            let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm[arm]);
             ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
         };
         let objects = [0, 1].map(pose);

@@ -77,7 +77,7 @@ impl TrialRunner {
     }
 
     /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it moves
-    /// `to` (own frame, metres) with an opening of `opening_m`.
+    /// `to` (arm frame, metres) with an opening of `opening_m`.
     fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         self.is_empty(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
@@ -103,7 +103,7 @@ impl TrialRunner {
     }
 
     /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
-    /// moves `to` (own frame, metres) the object.
+    /// moves `to` (arm frame, metres) the object.
     fn opens_beside(&self, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         let to_object = now.object - now.hand;
         opening_m > now.opening_m
@@ -137,7 +137,7 @@ fn holds(commanded_m: f64, now: &ArmObservation) -> bool {
     commanded_m < now.opening_m - HOLDS_M
 }
 
-/// Returns whether a hand that moves `to` (own frame, metres) descends to its object and ends with its pads higher than
+/// Returns whether a hand that moves `to` (arm frame, metres) descends to its object and ends with its pads higher than
 /// [`BESIDE_M`] above the object's centre.
 fn descends_to_object(now: &ArmObservation, to: DVec3) -> bool {
     to.z < now.hand.z

@@ -38,7 +38,7 @@ const MAX_PARTS: u32 = 20;
 /// A hand has arrived within this distance, metres.
 const ARRIVED_M: f64 = 0.015;
 
-/// A push along the table: the hand's positions before and after it, own frame, metres.
+/// A push along the table: the hand's positions before and after it, arm frame, metres.
 #[derive(Debug, PartialEq)]
 pub(super) struct Push {
     pub(super) from: DVec3,
@@ -105,7 +105,7 @@ impl ClosedLoop<'_, '_> {
         Ok(arrives)
     }
 
-    /// Moves the hand of `arm` `to` a position (own frame, metres) with an opening (metres on each side), in parts that the
+    /// Moves the hand of `arm` `to` a position (arm frame, metres) with an opening (metres on each side), in parts that the
     /// check of a motion allows. Returns whether the hand is there, rather than above a block or on its way.
     fn move_hand(
         &mut self,
@@ -135,17 +135,17 @@ impl TrialRunner {
     /// it, or else of the other one. There is none if no other object lies beside the arm's own, or if hands cannot reach the
     /// places.
     fn push(&self, arm: usize, objects: &[ObjectPose], state: &LoopState) -> Option<Push> {
-        let own = |object: &ObjectPose| self.mapping.object_in_own(ArmIndex(arm), object.at_m);
+        let in_arm = |object: &ObjectPose| self.mapping.object_in_arm(ArmIndex(arm), object.at_m);
         let half_m = f64::from(self.config.block.half_m);
-        let object = own(&objects[arm]);
+        let object = in_arm(&objects[arm]);
         let is_below = (object - self.hands(state)[arm]).truncate().length() < BELOW_M;
         let is_beside = |other: &usize| {
-            let apart_m = (own(&objects[*other]) - object).truncate().length();
+            let apart_m = (in_arm(&objects[*other]) - object).truncate().length();
             *other != arm && apart_m < 2.0 * half_m * SIDE_BY_SIDE
         };
         let other = (0..objects.len()).find(is_beside).filter(|_| is_below)?;
         let across = self.across(arm, state);
-        let apart = object - own(&objects[other]);
+        let apart = object - in_arm(&objects[other]);
         let away = if apart.dot(across) < 0.0 { -across } else { across };
         let pushes = [(arm, away), (arm, -away), (other, -away), (other, away)];
         let corner_m = std::f64::consts::SQRT_2 * half_m;
@@ -158,21 +158,21 @@ impl TrialRunner {
             };
             let has_room = (rests - push.from).truncate().length() > corner_m + PADS_M;
             let then = self.mapping.object_in_world(ArmIndex(arm), at + along * PUSH_M);
-            let then = self.mapping.object_in_own(ArmIndex(pushed), then);
+            let then = self.mapping.object_in_arm(ArmIndex(pushed), then);
             let is_reached = self.is_reached(push.from) && self.is_reached(push.to);
             (has_room && is_reached && self.is_reached(then)).then_some(push)
         })
     }
 
-    /// The horizontal direction across the closing direction of the hand of `arm`, own frame.
+    /// The horizontal direction across the closing direction of the hand of `arm`, arm frame.
     pub(super) fn across(&self, arm: usize, state: &LoopState) -> DVec3 {
         let placed = &self.mapping.cell().arms[arm];
         let in_world = tool_axes(placed, &state.at[arm]).y_axis;
-        let own = DQuat::from_rotation_z(-placed.yaw_rad) * in_world;
-        own.with_z(0.0).normalize_or(DVec3::X)
+        let in_arm = DQuat::from_rotation_z(-placed.yaw_rad) * in_world;
+        in_arm.with_z(0.0).normalize_or(DVec3::X)
     }
 
-    /// Returns whether hands reach the place above or at `at`, own frame, metres.
+    /// Returns whether hands reach the place above or at `at`, arm frame, metres.
     pub(super) fn is_reached(&self, at: DVec3) -> bool {
         (self.mapping.reachable_hand(at) - at).truncate().length() < REACH_M
     }
@@ -196,8 +196,8 @@ mod tests {
         let half_m = f64::from(runner.config.block.half_m);
         let object = hand.with_z(half_m);
         let push = |other: DVec3, object: DVec3| {
-            let pose = |own| ObjectPose {
-                at_m: runner.mapping.object_in_world(ArmIndex(0), own),
+            let pose = |in_arm| ObjectPose {
+                at_m: runner.mapping.object_in_world(ArmIndex(0), in_arm),
                 turn: DQuat::IDENTITY,
                 time_s: 0.0,
             };

@@ -13,7 +13,7 @@ pub(super) struct Progress {
     held_up: Vec<bool>,
     /// The number of consecutive steps, up to the last one, after which that was so.
     n_held_up: Vec<usize>,
-    /// Where the objects were when a misplaced one was last displaced, own frames, metres.
+    /// Where the objects were when a misplaced one was last displaced, arm frames, metres.
     rested: Vec<DVec3>,
     /// The number of observations since.
     n_idle: usize,
@@ -35,7 +35,7 @@ impl Progress {
         self.held_up.contains(&true)
     }
 
-    /// Counts a step that starts with the objects at `objects`, own frames, metres. `misplaced` says which of them are away
+    /// Counts a step that starts with the objects at `objects`, arm frames, metres. `misplaced` says which of them are away
     /// from their goals.
     pub(super) fn see(&mut self, objects: &[DVec3], misplaced: &[bool]) {
         for (n_held_up, is_held_up) in self.n_held_up.iter_mut().zip(&self.held_up) {

@@ -50,7 +50,7 @@ impl TrialRunner {
     /// first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the hand of
     /// `owner` can get at its object.
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
-        let object = self.mapping.object_in_own(owner, objects[owner.0].at_m);
+        let object = self.mapping.object_in_arm(owner, objects[owner.0].at_m);
         let away_m = if self.config.layout.task.grasps() { EDGE_M } else { AHEAD_M };
         let is_at_hand =
             |at: DVec3| self.is_reached(at - (goal - at).with_z(0.0).normalize_or_zero() * away_m);
@@ -71,9 +71,9 @@ impl TrialRunner {
             let from = object - along * (corner_m + PADS_M + GAP_M);
             let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
             recalls.extend((0..objects.len()).map(|arm| {
-                let seen = |own| {
-                    let at = self.mapping.object_in_world(owner, own);
-                    self.mapping.object_in_own(ArmIndex(arm), at)
+                let seen = |in_arm| {
+                    let at = self.mapping.object_in_world(owner, in_arm);
+                    self.mapping.object_in_arm(ArmIndex(arm), at)
                 };
                 (arm, Push { from: seen(from), to: seen(to) })
             }));
@@ -94,8 +94,8 @@ mod tests {
 
     fn recalls(task: Task, object: DVec3, goal: DVec3) -> Vec<(usize, Push)> {
         let runner = TrialRunner::new(test_config(task, TrialMode::ClosedLoop, 1)).unwrap();
-        let pose = |(arm, own)| ObjectPose {
-            at_m: runner.mapping.object_in_world(ArmIndex(arm), own),
+        let pose = |(arm, in_arm)| ObjectPose {
+            at_m: runner.mapping.object_in_world(ArmIndex(arm), in_arm),
             turn: DQuat::IDENTITY,
             time_s: 0.0,
         };
@@ -103,7 +103,7 @@ mod tests {
         runner.recalls(ArmIndex(0), &objects, goal)
     }
 
-    /// The position of a hand that is to go far in the direction `to`, own frame, metres.
+    /// The position of a hand that is to go far in the direction `to`, arm frame, metres.
     fn farthest(to: DVec3) -> DVec3 {
         let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
         TrialRunner::new(config).unwrap().mapping.reachable_hand(DVec3::new(0.1, 0.05, 0.03) + to)

@@ -54,8 +54,8 @@ impl TrialRunner {
         }
     }
 
-    /// Returns whether a hand that moves `to` (own frame, metres) would push its object to where no hand can follow. A
-    /// policy that pushes may do so toward the object's `goal`, own frame, metres.
+    /// Returns whether a hand that moves `to` (arm frame, metres) would push its object to where no hand can follow. A
+    /// policy that pushes may do so toward the object's `goal`, arm frame, metres.
     fn pushes_out_of_reach(&self, now: &ArmObservation, to: DVec3, goal: DVec3) -> bool {
         let top_m = now.object.z + self.config.trained_half_m;
         let to_object = (now.object - now.hand).truncate();
@@ -77,7 +77,7 @@ impl TrialRunner {
     }
 
     /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of the
-    /// other arm where it [should not](Self::disturbs) if it moves `to`, own frame of the first arm, metres. `across` is the
+    /// other arm where it [should not](Self::disturbs) if it moves `to`, frame of the first arm, metres. `across` is the
     /// direction across the closing direction of its gripper.
     fn pushes_from_its_arm(
         &self,
@@ -100,7 +100,7 @@ impl TrialRunner {
             .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], AHEAD_M))
     }
 
-    /// Returns whether something of the first arm that moves between two positions, own frame, metres, with objects
+    /// Returns whether something of the first arm that moves between two positions, arm frame, metres, with objects
     /// `ahead_m` metres ahead of it, would push the object of the other arm to where that arm's hand cannot follow. A
     /// gripper that grasps should not push it [at all](MOVED_M) either.
     fn disturbs(
@@ -112,7 +112,7 @@ impl TrialRunner {
     ) -> bool {
         let others = seen[other].object;
         let object = self.mapping.object_in_world(ArmIndex(other), others);
-        let object = self.mapping.object_in_own(ArmIndex(arm), object);
+        let object = self.mapping.object_in_arm(ArmIndex(arm), object);
         let lowest_m = from.z.min(to.z);
         let half_m = self.config.trained_half_m;
         let to_object = (object - from).truncate();
@@ -131,7 +131,7 @@ impl TrialRunner {
             return true;
         }
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
-        let then = self.mapping.object_in_own(ArmIndex(other), then);
+        let then = self.mapping.object_in_arm(ArmIndex(other), then);
         let behind = (then - others).normalize_or_zero() * self.behind_m();
         let beyond = |at: DVec3| beyond_m(at + behind, self.mapping.reachable_hand(at + behind));
         beyond(then) > beyond(others) + BEYOND_M
@@ -201,7 +201,7 @@ pub(super) mod tests {
             // In front of one of the pads.
             let object = (hand + across * 0.06 + pad).with_z(0.03);
             let others = runner.mapping.object_in_world(ArmIndex(0), object);
-            let others = runner.mapping.object_in_own(ArmIndex(1), others);
+            let others = runner.mapping.object_in_arm(ArmIndex(1), others);
             let now =
                 [seen(hand, hand - DVec3::X * 0.3), seen(DVec3::new(0.0, -0.15, 0.2), others)];
             let to = hand + across * 0.04;
@@ -224,7 +224,7 @@ pub(super) mod tests {
         // As far from the second arm as its hand reaches, seen from the first arm, toward whose base the hand moves.
         let farthest = runner.mapping.reachable_hand(DVec3::new(1.0, 0.0, 0.03));
         let in_world = runner.mapping.object_in_world(ArmIndex(1), farthest);
-        let seen_by_first = runner.mapping.object_in_own(ArmIndex(0), in_world);
+        let seen_by_first = runner.mapping.object_in_arm(ArmIndex(0), in_world);
         let hand = seen_by_first + DVec3::X * 0.05;
         let away = DVec3::new(0.1, 0.15, 0.03);
         let mut moved = |to: DVec3| {

@@ -16,7 +16,7 @@ const ROOM_M: f64 = 0.06;
 const SLOW: f64 = 0.25;
 
 impl TrialRunner {
-    /// Returns the speed of a step that moves the hands `to` (own frames, metres), as a share of the trial's. What arms
+    /// Returns the speed of a step that moves the hands `to` (arm frames, metres), as a share of the trial's. What arms
     /// share is between their hands all the time, and they do not press on it.
     pub(super) fn step_speed(
         &self,

@@ -17,10 +17,10 @@ use crate::trial::shared_object::keep_distance;
 /// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
 const STILL_M: f64 = 5e-4;
 const STILL_OPENING: f64 = 0.005;
-/// The displacement of an arm that makes room, own frame, metres.
+/// The displacement of an arm that makes room, arm frame, metres.
 const BACK_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
 
-/// The displacements of an arm that stays or withdraws from the other one, own frame, metres.
+/// The displacements of an arm that stays or withdraws from the other one, arm frame, metres.
 const APART_M: [DVec3; 5] = [
     DVec3::ZERO,
     DVec3::new(-0.04, 0.0, 0.02),
@@ -91,7 +91,7 @@ impl ClosedLoop<'_, '_> {
         Ok(false)
     }
 
-    /// Moves the hands `to` (own frames, metres) if `check` allows it. Returns whether it does, also if the hands are there.
+    /// Moves the hands `to` (arm frames, metres) if `check` allows it. Returns whether it does, also if the hands are there.
     pub(super) fn attempt(
         &mut self,
         wanted: &WantedStep<'_>,
@@ -149,13 +149,13 @@ impl TrialRunner {
             .collect()
     }
 
-    /// The end effectors at the commanded angles, own frames, metres.
+    /// The end effectors at the commanded angles, arm frames, metres.
     pub(super) fn hands(&self, state: &LoopState) -> Vec<DVec3> {
         let arms = state.at.iter().enumerate();
-        arms.map(|(arm, at)| self.mapping.hand_in_own(ArmIndex(arm), at)).collect()
+        arms.map(|(arm, at)| self.mapping.hand_in_arm(ArmIndex(arm), at)).collect()
     }
 
-    /// Returns the positions of the hands (own frames, metres) in which two arms are farther apart than `from`, farthest
+    /// Returns the positions of the hands (arm frames, metres) in which two arms are farther apart than `from`, farthest
     /// first.
     fn ways_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
         let gap_m = |hands: &[DVec3]| {
@@ -181,13 +181,13 @@ impl TrialRunner {
         ways.into_iter().map(|(_, to)| to).collect()
     }
 
-    /// Returns the points between the pads of end effectors at `hands` (own frames, metres), world frame, metres.
+    /// Returns the points between the pads of end effectors at `hands` (arm frames, metres), world frame, metres.
     pub(super) fn pads_of(&self, hands: &[DVec3]) -> Vec<DVec3> {
         let hands = hands.iter().enumerate();
-        hands.map(|(arm, own)| self.mapping.pads_in_world(ArmIndex(arm), *own)).collect()
+        hands.map(|(arm, in_arm)| self.mapping.pads_in_world(ArmIndex(arm), *in_arm)).collect()
     }
 
-    /// Moves the end effectors `to` so that they are as far apart as `from`; own frames, metres.
+    /// Moves the end effectors `to` so that they are as far apart as `from`; arm frames, metres.
     fn keep_hands_apart(&self, from: &[DVec3], to: &mut [DVec3]) {
         let mut pads = self.pads_of(to);
         keep_distance(&self.pads_of(from), &mut pads);
@@ -196,7 +196,7 @@ impl TrialRunner {
         }
     }
 
-    /// Returns the waypoints of the tools for end effectors that move `to` (own frames, metres): two corners, the end, and
+    /// Returns the waypoints of the tools for end effectors that move `to` (arm frames, metres): two corners, the end, and
     /// the end again with closed grippers. A gripper that closed while it moves would drag its object along. `measured`
     /// are the openings of the grippers, 0 to 1. Also returns whether a block keeps each hand from where it is to be.
     fn step_waypoints(
@@ -215,7 +215,8 @@ impl TrialRunner {
             let (idx, near) = (ArmIndex(arm), &state.at[arm]);
             let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
-            let [from, to] = [from[arm], to[arm]].map(|own| self.mapping.pads_in_world(idx, own));
+            let [from, to] =
+                [from[arm], to[arm]].map(|in_arm| self.mapping.pads_in_world(idx, in_arm));
             let tool = |pads| {
                 let tool = self.mapping.tool_for_pads(idx, pads, near);
                 tool.map_err(|source| unreachable(idx, source))

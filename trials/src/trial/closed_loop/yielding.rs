@@ -23,7 +23,7 @@ impl ClosedLoop<'_, '_> {
         let forces_n = self.rig.forces_n();
         for (arm, (angles, opening)) in self.rig.encoders().into_iter().enumerate() {
             state.at[arm] = angles;
-            let opening_m = mapping.opening_in_own(opening);
+            let opening_m = mapping.policy_opening_m(opening);
             // A gripper that holds something keeps its grip, unless its hand presses on something.
             let grips = state.openings_m[arm] < opening_m - GRIPPED_M;
             if !grips || forces_n[arm].length() >= PRESSING_N {
