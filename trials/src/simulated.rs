@@ -321,7 +321,7 @@ fn objects(world: &PhysicsWorld, time_s: f64) -> Vec<ObjectPose> {
     let pose = |idx| {
         let pose = world.object(idx);
         let at_m = pose.translation.as_dvec3();
-        ObjectPose { at_m, turn: pose.rotation.as_dquat(), time_s }
+        ObjectPose { at_m, orientation: pose.rotation.as_dquat(), time_s }
     };
     (0..world.n_objects()).map(pose).collect()
 }

@@ -315,8 +315,8 @@ impl PhysicsWorld {
     }
 
     fn add_shared(&mut self, object: &SharedObject, friction: f32) {
-        let turn = Rotation::from_rotation_z(object.yaw_rad);
-        let pose = Pose::from_parts(Vector::from_array(object.at_m), turn);
+        let rotation = Rotation::from_rotation_z(object.yaw_rad);
+        let pose = Pose::from_parts(Vector::from_array(object.at_m), rotation);
         let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
         for part in &object.boxes {
             let part = object_box(Vector::from_array(part.half_m), part.mass_kg, friction)
@@ -346,8 +346,8 @@ impl ArmPoses {
     fn forearm(&self) -> Pose {
         let [from, to] = self.forearm_m;
         let along = (to - from).normalize().as_vec3();
-        let turn = Rotation::from_rotation_arc(Vector::Z, along);
-        Pose::from_parts((0.5 * (from + to)).as_vec3(), turn)
+        let rotation = Rotation::from_rotation_arc(Vector::Z, along);
+        Pose::from_parts((0.5 * (from + to)).as_vec3(), rotation)
     }
 }
 
@@ -363,8 +363,9 @@ fn object_box(half_m: Vector, mass_kg: f32, friction: f32) -> ColliderBuilder {
 /// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as
 /// a full turn.
 fn nearest(pose: &Pose, from: &Pose) -> Pose {
-    let turn = if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
-    Pose::from_parts(pose.translation, turn)
+    let rotation =
+        if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
+    Pose::from_parts(pose.translation, rotation)
 }
 
 /// Converts to the single precision of the physics.

@@ -177,7 +177,7 @@ impl TrialRunner {
         objects: &[ObjectPose],
         shared: Option<&SharedObject>,
     ) -> Vec<ObservedBlock> {
-        let yaw_rad = |object: &ObjectPose| object.turn.to_euler(EulerRot::ZYX).0;
+        let yaw_rad = |object: &ObjectPose| object.orientation.to_euler(EulerRot::ZYX).0;
         let Some(shared) = shared else {
             let half_m = DVec3::splat(self.config.block.half_m.into());
             let block = |object: &ObjectPose| ObservedBlock {
@@ -197,7 +197,7 @@ impl TrialRunner {
             let arm = (0..objects.len()).min_by(nearer).unwrap_or(0);
             let object = &objects[arm];
             ObservedBlock {
-                at: object.at_m + object.turn * offset(arm),
+                at: object.at_m + object.orientation * offset(arm),
                 yaw_rad: yaw_rad(object),
                 half_m: double(part.half_extents_m),
             }

@@ -119,7 +119,11 @@ fn without_noise(simulated: &SimulatedConfig) -> SimulatedConfig {
         angle_noise_rad: 0.0,
         rate_noise_radps: 0.0,
         torque_noise_nm: 0.0,
-        camera: CameraConfig { place_noise_m: 0.0, turn_noise_rad: 0.0, ..simulated.camera },
+        camera: CameraConfig {
+            position_noise_m: 0.0,
+            orientation_noise_rad: 0.0,
+            ..simulated.camera
+        },
         ..simulated.clone()
     }
 }

@@ -63,7 +63,7 @@ pub struct ArmObservation {
     /// The object, arm frame, metres.
     pub object: DVec3,
     /// The orientation of the object, arm frame.
-    pub turn: DQuat,
+    pub orientation: DQuat,
 }
 
 impl Mapping {
@@ -212,7 +212,7 @@ impl Mapping {
             hand_velocity,
             opening_m,
             object: self.object_in_arm(arm, seen.at_m),
-            turn: upright * seen.turn * upright.inverse(),
+            orientation: upright * seen.orientation * upright.inverse(),
         }
     }
 
@@ -288,28 +288,28 @@ fn write_observation(
     let together = together.clamp(0.0, 1.0);
     let object_velocity =
         hand_velocity * together + (object_way - hand_way * together) * end_velocity_share;
-    let turn = (now.turn * before.turn.inverse()).normalize();
-    let turn = if turn.w < 0.0 { -turn } else { turn };
-    let turn_velocity = turn.to_scaled_axis() * end_velocity_share;
+    let rotation = (now.orientation * before.orientation.inverse()).normalize();
+    let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+    let angular_velocity = rotation.to_scaled_axis() * end_velocity_share;
     let opening_rate_m = now.opening_m - before.opening_m;
-    let facing = if now.turn.w < 0.0 { -now.turn } else { now.turn };
+    let orientation = if now.orientation.w < 0.0 { -now.orientation } else { now.orientation };
     let parts = [
         now.hand,
         now.object,
         now.object - now.hand,
         DVec3::splat(now.opening_m),
-        DVec3::new(facing.x, facing.y, facing.z),
+        DVec3::new(orientation.x, orientation.y, orientation.z),
     ];
     let rates = [
         object_velocity - hand_velocity,
-        turn_velocity,
+        angular_velocity,
         hand_velocity,
         DVec3::splat(opening_rate_m),
     ];
     for (idx, part) in parts.iter().enumerate() {
         observation[3 * idx..3 * idx + 3].copy_from_slice(&part.as_vec3().to_array());
     }
-    observation[15] = facing.as_quat().w;
+    observation[15] = orientation.as_quat().w;
     for (idx, part) in rates.iter().enumerate() {
         observation[16 + 3 * idx..19 + 3 * idx].copy_from_slice(&part.as_vec3().to_array());
     }

@@ -25,7 +25,7 @@ const RISE_M: f64 = 0.06;
 
 /// What follows a step when arms block each other or an arm waits.
 #[derive(Debug, PartialEq)]
-enum Turn {
+enum NextAction {
     /// All arms continue as before.
     Same,
     /// These arms retreat and keep out of the way; the others continue.
@@ -99,14 +99,14 @@ impl ClosedLoop<'_, '_> {
             }
             if is_blocked || self.state.parked.contains(&true) {
                 let objects = self.rig.observe_objects()?;
-                match runner.next_turn(&objects, start, &mut self.state, is_blocked) {
-                    Turn::Same => {}
-                    Turn::Parks(parks) => {
+                match runner.next_action(&objects, start, &mut self.state, is_blocked) {
+                    NextAction::Same => {}
+                    NextAction::Parks(parks) => {
                         self.retreat(&parks)?;
                         self.state.parked = parks;
                         n_in_episode = 0;
                     }
-                    Turn::NextEpisode => {
+                    NextAction::NextEpisode => {
                         self.start_next_episode()?;
                         n_in_episode = 0;
                     }
@@ -163,22 +163,22 @@ impl TrialRunner {
     /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
     /// the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its turn
     /// comes when the object of the other one lies at its goal.
-    fn next_turn(
+    fn next_action(
         &self,
         objects: &[ObjectPose],
         start: &TrialStart,
         state: &mut LoopState,
         is_blocked: bool,
-    ) -> Turn {
+    ) -> NextAction {
         let misplaced: Vec<bool> = self.misplaced(objects, start).collect();
         let is_waiting =
             misplaced.iter().zip(&state.parked).any(|(misplaced, parked)| *misplaced && *parked);
         let parks = self.parking(objects, &misplaced, state);
         if (is_blocked || is_waiting) && parks.contains(&true) {
-            return Turn::Parks(parks);
+            return NextAction::Parks(parks);
         }
         if !is_blocked {
-            return Turn::Same;
+            return NextAction::Same;
         }
         match self.goal_distances_m(objects, start)[..] {
             [one_m, other_m] if !state.parked.contains(&true) => {
@@ -187,9 +187,9 @@ impl TrialRunner {
                 let is_other_placed = misplaced[farther] && !misplaced[1 - farther];
                 let waiting = (farther + usize::from(is_other_placed) + state.n_waits) % 2;
                 state.n_waits += 1;
-                Turn::Parks(vec![waiting == 0, waiting == 1])
+                NextAction::Parks(vec![waiting == 0, waiting == 1])
             }
-            _ => Turn::NextEpisode,
+            _ => NextAction::NextEpisode,
         }
     }
 
@@ -273,33 +273,33 @@ mod tests {
             let pose = |(arm, distance_m): (usize, f64)| {
                 let in_arm = start.goals[arm] + DVec3::X * distance_m;
                 let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm);
-                ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+                ObjectPose { at_m, orientation: DQuat::IDENTITY, time_s: 0.0 }
             };
             distances_m.into_iter().enumerate().map(pose).collect::<Vec<_>>()
         };
         let neither = objects([0.1, 0.2]);
-        let mut turn = |objects: &[ObjectPose], parked: [bool; 2], is_blocked| {
+        let mut next = |objects: &[ObjectPose], parked: [bool; 2], is_blocked| {
             state.parked = parked.to_vec();
-            runner.next_turn(objects, &start, &mut state, is_blocked)
+            runner.next_action(objects, &start, &mut state, is_blocked)
         };
-        let parks = |arms: [bool; 2]| Turn::Parks(arms.to_vec());
-        assert_eq!(turn(&neither, [false; 2], false), Turn::Same);
-        assert_eq!(turn(&neither, [false; 2], true), parks([false, true]), "the farther one waits");
-        assert_eq!(turn(&neither, [false, true], false), Turn::Same);
+        let parks = |arms: [bool; 2]| NextAction::Parks(arms.to_vec());
+        assert_eq!(next(&neither, [false; 2], false), NextAction::Same);
+        assert_eq!(next(&neither, [false; 2], true), parks([false, true]), "the farther one waits");
+        assert_eq!(next(&neither, [false, true], false), NextAction::Same);
         let first = objects([0.0, 0.2]);
         assert_eq!(
-            turn(&first, [false, true], false),
+            next(&first, [false, true], false),
             parks([true, false]),
             "the other one's turn"
         );
-        assert_eq!(turn(&first, [true, false], false), Turn::Same, "nothing waits");
+        assert_eq!(next(&first, [true, false], false), NextAction::Same, "nothing waits");
         assert_eq!(
-            turn(&neither, [false, true], true),
-            Turn::NextEpisode,
+            next(&neither, [false, true], true),
+            NextAction::NextEpisode,
             "blocked although one waits"
         );
-        assert_eq!(turn(&neither, [false; 2], true), parks([true, false]), "roles alternate");
-        assert_eq!(turn(&first, [false; 2], true), parks([true, false]), "placed ones make way");
+        assert_eq!(next(&neither, [false; 2], true), parks([true, false]), "roles alternate");
+        assert_eq!(next(&first, [false; 2], true), parks([true, false]), "placed ones make way");
     }
 
     #[test]
@@ -313,11 +313,11 @@ mod tests {
         let in_arm = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
         let pose = |arm: usize| {
             let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm[arm]);
-            ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+            ObjectPose { at_m, orientation: DQuat::IDENTITY, time_s: 0.0 }
         };
         let objects = [0, 1].map(pose);
         assert_eq!(runner.lying(&objects).next(), Some(false));
-        let turn = runner.next_turn(&objects, &start, &mut state, true);
-        assert_eq!(turn, Turn::Parks(vec![true, false]), "the misplaced one is farther");
+        let next = runner.next_action(&objects, &start, &mut state, true);
+        assert_eq!(next, NextAction::Parks(vec![true, false]), "the misplaced one is farther");
     }
 }

@@ -72,7 +72,7 @@ impl TrialRunner {
 
     /// The opening between which the object fits as it is rotated, metres on each side.
     fn narrow_opening_m(&self, now: &ArmObservation) -> f64 {
-        let (sin, cos) = libm::sincos(now.turn.to_euler(EulerRot::ZYX).0);
+        let (sin, cos) = libm::sincos(now.orientation.to_euler(EulerRot::ZYX).0);
         (sin.abs() + cos.abs()) * self.config.trained_half_m + CLEARANCE_M
     }
 
@@ -246,7 +246,7 @@ mod tests {
         let narrow_m = runner.config.trained_half_m + CLEARANCE_M;
         assert_eq!(opening_m(above), [narrow_m, 0.06]);
         let yaw = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_4);
-        let wider_m = opening_m(ArmObservation { turn: yaw, ..above })[0];
+        let wider_m = opening_m(ArmObservation { orientation: yaw, ..above })[0];
         assert!((wider_m - CLEARANCE_M - 2.0_f64.sqrt() * (narrow_m - CLEARANCE_M)).abs() < 1e-9);
         let away = ArmObservation { hand: above.hand + DVec3::X * 0.1, ..above };
         assert_eq!(opening_m(away), [0.06, 0.06]);

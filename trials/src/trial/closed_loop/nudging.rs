@@ -198,7 +198,7 @@ mod tests {
         let push = |other: DVec3, object: DVec3| {
             let pose = |in_arm| ObjectPose {
                 at_m: runner.mapping.object_in_world(ArmIndex(0), in_arm),
-                turn: DQuat::IDENTITY,
+                orientation: DQuat::IDENTITY,
                 time_s: 0.0,
             };
             runner.push(0, &[pose(object), pose(other)], &state)

@@ -96,8 +96,8 @@ mod tests {
     fn arms_are_idle_until_a_misplaced_object_is_displaced() {
         let mut progress = Progress::new(2);
         let mut see = |x_m: f64, n: usize| {
-            for turn in 0..n {
-                let placed = DVec3::Y * turn as f64;
+            for step in 0..n {
+                let placed = DVec3::Y * step as f64;
                 progress.see(&[DVec3::X * x_m, placed], &[true, false]);
             }
             progress.is_idle()

@@ -96,7 +96,7 @@ mod tests {
         let runner = TrialRunner::new(test_config(task, TrialMode::ClosedLoop, 1)).unwrap();
         let pose = |(arm, in_arm)| ObjectPose {
             at_m: runner.mapping.object_in_world(ArmIndex(arm), in_arm),
-            turn: DQuat::IDENTITY,
+            orientation: DQuat::IDENTITY,
             time_s: 0.0,
         };
         let objects = [(0, object), (1, DVec3::new(0.1, 0.1, object.z))].map(pose);

@@ -163,7 +163,7 @@ pub(super) mod tests {
             hand_velocity: DVec3::ZERO,
             opening_m: 0.05,
             object,
-            turn: DQuat::IDENTITY,
+            orientation: DQuat::IDENTITY,
         }
     }
 
