@@ -49,7 +49,7 @@ pub(crate) struct Pads {
 
 /// The path of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Way {
+pub(crate) struct StepPath {
     /// Two corners and the end of the path of the point between the pads, world frame, metres.
     pub(crate) points: [DVec3; 3],
     /// Whether a block keeps the hand from reaching its wanted position.
@@ -63,11 +63,11 @@ pub(crate) fn lowered(from: &Pads, to: DVec3, blocks: &[ObservedBlock]) -> DVec3
 }
 
 /// Returns the path of the point between the pads from `from` towards `to`.
-pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> Way {
+pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> StepPath {
     let start = from.centre;
     let to = Pads { centre: lowered(from, to.centre, blocks), ..*to };
     let end = to.centre;
-    let free = |corner| Way { points: [start, corner, end], is_held_up: false };
+    let free = |corner| StepPath { points: [start, corner, end], is_held_up: false };
     if end.z >= start.z {
         return free(start.midpoint(end));
     }
@@ -103,7 +103,7 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
     let highest_m = start.z + lift_m;
     let last = end.with_z(end.z.max(lowest_m.min(highest_m)));
     let points = [start.with_z(highest_m), last.with_z(highest_m), last];
-    Way { points, is_held_up: last.z > end.z + HELD_UP_M }
+    StepPath { points, is_held_up: last.z > end.z + HELD_UP_M }
 }
 
 impl ObservedBlock {
@@ -241,7 +241,10 @@ mod tests {
         let path =
             |opening_m, block| avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block]);
         let open = path(0.05, BLOCK);
-        assert_eq!(open, Way { points: [from, DVec3::new(0.1, 0.0, 0.12), to], is_held_up: false });
+        assert_eq!(
+            open,
+            StepPath { points: [from, DVec3::new(0.1, 0.0, 0.12), to], is_held_up: false }
+        );
         let closed = path(0.0, BLOCK);
         let end = closed.points[2];
         assert!((end.z - (0.056 + PAD_HALF_M.z + ABOVE_M)).abs() < 1e-12, "{end}");
@@ -287,10 +290,10 @@ mod tests {
         let (from, to) = (tilted(from), tilted(DVec3::new(0.1, 0.03, 0.05)));
         let is_above = from.each().map(|pad| pad.is_above(&BLOCK));
         assert_eq!(is_above, [true, false]);
-        let way = avoid_blocks(&from, &to, &[BLOCK]);
-        let lowest_m = tilted(way.points[2]).each().map(|pad| pad.lowest_m());
+        let path = avoid_blocks(&from, &to, &[BLOCK]);
+        let lowest_m = tilted(path.points[2]).each().map(|pad| pad.lowest_m());
         assert!(lowest_m[1] >= 0.056 + ABOVE_M - 1e-12, "{lowest_m:?}");
-        assert!(way.is_held_up);
+        assert!(path.is_held_up);
     }
 
     #[test]
@@ -299,10 +302,10 @@ mod tests {
         let held = ObservedBlock { at: from, ..BLOCK };
         let holding = |centre| Pads { commanded_m: 0.0, ..pads(centre, 0.028) };
         let to = DVec3::new(0.1, 0.0, 0.05);
-        let way = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
-        let lowest_m = way.points[2].z - 0.028;
+        let path = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
+        let lowest_m = path.points[2].z - 0.028;
         assert!((lowest_m - (0.056 + ABOVE_M)).abs() < 1e-12, "{lowest_m}");
-        assert!(way.is_held_up);
+        assert!(path.is_held_up);
         let alone = avoid_blocks(&holding(from), &holding(to), &[held]);
         assert_eq!(alone.points[2], to);
     }

@@ -283,11 +283,13 @@ fn write_observation(
 ) {
     let hand_velocity = now.hand_velocity * hand.control_step_s();
     let end_velocity_share = hand.end_velocity_share();
-    let (hand_way, object_way) = (now.hand - before.hand, now.object - before.object);
-    let together = object_way.dot(hand_way) / hand_way.length_squared().max(1e-6);
+    let (hand_displacement, object_displacement) =
+        (now.hand - before.hand, now.object - before.object);
+    let together =
+        object_displacement.dot(hand_displacement) / hand_displacement.length_squared().max(1e-6);
     let together = together.clamp(0.0, 1.0);
-    let object_velocity =
-        hand_velocity * together + (object_way - hand_way * together) * end_velocity_share;
+    let object_velocity = hand_velocity * together
+        + (object_displacement - hand_displacement * together) * end_velocity_share;
     let rotation = (now.orientation * before.orientation.inverse()).normalize();
     let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
     let angular_velocity = rotation.to_scaled_axis() * end_velocity_share;

@@ -225,7 +225,7 @@ impl TrialRunner {
     /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far as
     /// the arms reach.
     fn withdrawal(&self, from: &Waypoint, at: &[Joints]) -> Vec<Waypoint> {
-        let way = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
+        let path = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
             let index = ArmIndex(arm);
             let placed = &self.mapping.cell().arms[arm];
             let target = placed.target(&waypoint.tool_in_world_m);
@@ -249,9 +249,9 @@ impl TrialRunner {
             };
             (0..N_WITHDRAWAL_STEPS).map(step).collect()
         };
-        let ways: Vec<Vec<ArmWaypoint>> =
-            from.iter().enumerate().map(|(arm, waypoint)| way(arm, waypoint)).collect();
-        (0..N_WITHDRAWAL_STEPS).map(|step| ways.iter().map(|way| way[step]).collect()).collect()
+        let paths: Vec<Vec<ArmWaypoint>> =
+            from.iter().enumerate().map(|(arm, waypoint)| path(arm, waypoint)).collect();
+        (0..N_WITHDRAWAL_STEPS).map(|step| paths.iter().map(|path| path[step]).collect()).collect()
     }
 }
 
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn arms_whose_ways_end_in_each_other_withdraw() {
+    fn arms_whose_paths_end_in_each_other_withdraw() {
         let runner = runner(Task::SharedPush);
         let cell = runner.mapping.cell();
         let near = cell.ready(0.2).unwrap();

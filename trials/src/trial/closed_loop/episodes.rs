@@ -140,12 +140,12 @@ impl ClosedLoop<'_, '_> {
         let lifted: Vec<bool> = runner.lying(&objects).map(|lies| !lies).collect();
         let raised = |hand: DVec3| runner.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
         let withdrawn = |hand: DVec3| runner.mapping.withdrawn_hand(hand);
-        let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
-        for way in ways {
+        let targets: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
+        for target in targets {
             let mut hands = runner.hands(&self.state);
             let mut openings_m = self.state.openings_m.clone();
             for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
-                hands[arm] = way(hands[arm]);
+                hands[arm] = target(hands[arm]);
                 if !lifted[arm] {
                     openings_m[arm] = open_m;
                 }

@@ -87,7 +87,7 @@ impl ClosedLoop<'_, '_> {
             self.move_hand(arm, (down, holding_m), &blocks)?;
             self.move_hand(arm, (runner.hands(&self.state)[arm], open_m), &blocks)?;
         }
-        let ways = [
+        let positions = [
             (raised, open_m),
             (from.with_z(raised.z), 0.0),
             (from, 0.0),
@@ -95,7 +95,7 @@ impl ClosedLoop<'_, '_> {
             (to.with_z(raised.z), open_m),
         ];
         let mut arrives = true;
-        for (hand, opening_m) in ways {
+        for (hand, opening_m) in positions {
             arrives = self.move_hand(arm, (hand, opening_m), &blocks)?;
             if !arrives {
                 break;

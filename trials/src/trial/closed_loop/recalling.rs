@@ -58,13 +58,13 @@ impl TrialRunner {
             return Vec::new();
         }
         let to_goal = (goal - object).with_z(0.0);
-        let ways = [to_goal, to_goal.with_x(0.0), to_goal.with_y(0.0)];
+        let displacements = [to_goal, to_goal.with_x(0.0), to_goal.with_y(0.0)];
         let half_m = f64::from(self.config.block.half_m);
         let corner_m = std::f64::consts::SQRT_2 * half_m;
         let mut recalls = Vec::new();
-        for way in ways.into_iter().filter(|way| way.length() > UNIT_M) {
-            let along = way.normalize();
-            let n_units = (way.length() / UNIT_M).floor();
+        for displacement in displacements.into_iter().filter(|by| by.length() > UNIT_M) {
+            let along = displacement.normalize();
+            let n_units = (displacement.length() / UNIT_M).floor();
             let is_back = |n: &f64| is_at_hand(object + along * (*n * UNIT_M));
             let mut units = (1..MAX_UNITS).map(f64::from).take_while(|n| *n < n_units);
             let n_units = units.find(is_back).map_or(n_units, |n| n + 1.0);

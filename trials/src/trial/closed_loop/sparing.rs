@@ -1,6 +1,6 @@
 //! Steps of a policy that would push objects where hands can neither grasp them nor push them back.
 //!
-//! A hand that misses its object pushes it ahead, and so does one whose way leads past the other arm's object.
+//! A hand that misses its object pushes it ahead, and so does one whose path leads past the other arm's object.
 
 use glam::DVec3;
 use tandem_core::ArmIndex;
@@ -59,15 +59,16 @@ impl TrialRunner {
     fn pushes_out_of_reach(&self, now: &ArmObservation, to: DVec3, goal: DVec3) -> bool {
         let top_m = now.object.z + self.config.trained_half_m;
         let to_object = (now.object - now.hand).truncate();
-        let way = (to - now.hand).truncate();
+        let displacement = (to - now.hand).truncate();
         if now.hand.z.min(to.z) >= top_m
             || to_object.length() < BETWEEN_M
-            || way.dot(to_object) <= 0.0
+            || displacement.dot(to_object) <= 0.0
         {
             return false;
         }
         let to_goal = (goal - now.object).truncate();
-        if !self.config.layout.task.grasps() && (to_goal - way).length() < to_goal.length() {
+        if !self.config.layout.task.grasps() && (to_goal - displacement).length() < to_goal.length()
+        {
             return false;
         }
         let ahead = (to_object.normalize() * (AHEAD_M + self.behind_m())).extend(0.0);
@@ -90,8 +91,8 @@ impl TrialRunner {
         let half_m = self.config.trained_half_m;
         if (now.object - now.hand).length() < HELD_M {
             let lowest = DVec3::NEG_Z * half_m;
-            let way = [now.hand, to].map(|hand| hand + lowest);
-            return self.disturbs(arms, seen, way, 2.0 * half_m);
+            let path = [now.hand, to].map(|hand| hand + lowest);
+            return self.disturbs(arms, seen, path, 2.0 * half_m);
         }
         let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_M);
         let pads = if self.config.layout.task.grasps() { vec![pad, -pad] } else { Vec::new() };
@@ -116,17 +117,17 @@ impl TrialRunner {
         let lowest_m = from.z.min(to.z);
         let half_m = self.config.trained_half_m;
         let to_object = (object - from).truncate();
-        let way = (to - from).truncate();
-        let aside_m = way.normalize_or_zero().perp_dot(to_object).abs();
+        let displacement = (to - from).truncate();
+        let aside_m = displacement.normalize_or_zero().perp_dot(to_object).abs();
         let gap_m = to_object.length() - ahead_m;
         if lowest_m >= object.z + half_m
-            || way.dot(to_object) <= 0.0
+            || displacement.dot(to_object) <= 0.0
             || aside_m > ahead_m
-            || gap_m > way.length()
+            || gap_m > displacement.length()
         {
             return false;
         }
-        let moved = (way - way.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
+        let moved = (displacement - displacement.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
         if self.config.layout.task.grasps() && moved.length() > MOVED_M {
             return true;
         }

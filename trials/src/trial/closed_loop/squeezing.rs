@@ -52,8 +52,8 @@ fn share_within(one: DVec3, other: DVec3, block: &ObservedBlock) -> f64 {
     let (mut enters, mut leaves) = (0.0_f64, 1.0_f64);
     for axis in 0..3 {
         // A line along a side crosses it at infinity, which leaves the whole line or nothing.
-        let way = to[axis] - from[axis];
-        let crossing = [-half[axis], half[axis]].map(|side| (side - from[axis]) / way);
+        let displacement = to[axis] - from[axis];
+        let crossing = [-half[axis], half[axis]].map(|side| (side - from[axis]) / displacement);
         enters = enters.max(crossing[0].min(crossing[1]));
         leaves = leaves.min(crossing[0].max(crossing[1]));
     }
@@ -70,7 +70,7 @@ mod tests {
         ObservedBlock { at: DVec3::new(0.1, 0.0, 0.03), yaw_rad: 0.0, half_m: DVec3::splat(0.03) };
 
     #[test]
-    fn room_is_what_the_blocks_leave_of_the_way_from_hand_to_hand() {
+    fn room_is_what_the_blocks_leave_of_the_line_from_hand_to_hand() {
         let hand = |x, z| DVec3::new(x, 0.0, z);
         let room = |one, other, blocks: &[ObservedBlock]| room_m(one, other, blocks);
         let near = |got: Option<f64>, wanted: f64| {

@@ -8,7 +8,7 @@ use tandem_kinematics::{
 
 use super::{ClosedLoop, LoopState, WantedStep};
 use crate::simulated::MAX_OPENING_M;
-use crate::trial::block_avoidance::{Pads, Way, avoid_blocks, lowered};
+use crate::trial::block_avoidance::{Pads, StepPath, avoid_blocks, lowered};
 use crate::trial::outcome::FailureCause;
 use crate::trial::rig::tool_positions;
 use crate::trial::runner::{TrialRunner, unreachable};
@@ -82,7 +82,7 @@ impl ClosedLoop<'_, '_> {
             }
         }
         if !self.state.carries {
-            for to in runner.ways_apart(&from, &self.state) {
+            for to in runner.positions_apart(&from, &self.state) {
                 if self.attempt(wanted, &to, &runner.check)? {
                     break;
                 }
@@ -157,7 +157,7 @@ impl TrialRunner {
 
     /// Returns the positions of the hands (arm frames, metres) in which two arms are farther apart than `from`, farthest
     /// first.
-    fn ways_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
+    fn positions_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
         let gap_m = |hands: &[DVec3]| {
             let reached = hands.iter().zip(&state.at).enumerate().map(|(arm, (hand, near))| {
                 self.mapping.tool_in_world(ArmIndex(arm), *hand, near).map(|(_, angles)| angles)
@@ -167,18 +167,18 @@ impl TrialRunner {
         };
         let [first, second] = from else { return Vec::new() };
         let now_m = gap_m(from);
-        let mut ways: Vec<(f64, Vec<DVec3>)> = Vec::new();
+        let mut candidates: Vec<(f64, Vec<DVec3>)> = Vec::new();
         for one in APART_M {
             for other in APART_M {
                 let to = vec![*first + one, *second + other];
                 let to_m = gap_m(&to);
                 if to_m > now_m {
-                    ways.push((to_m, to));
+                    candidates.push((to_m, to));
                 }
             }
         }
-        ways.sort_by(|(one_m, _), (other_m, _)| other_m.total_cmp(one_m));
-        ways.into_iter().map(|(_, to)| to).collect()
+        candidates.sort_by(|(one_m, _), (other_m, _)| other_m.total_cmp(one_m));
+        candidates.into_iter().map(|(_, to)| to).collect()
     }
 
     /// Returns the points between the pads of end effectors at `hands` (arm frames, metres), world frame, metres.
@@ -229,19 +229,19 @@ impl TrialRunner {
                 commanded_m: before * f64::from(MAX_OPENING_M),
             };
             let pads_before = pads(from, near);
-            let way = if state.carries {
+            let path = if state.carries {
                 let end = lowered(&pads_before, to, blocks);
-                Way { points: [from, from.midpoint(end), end], is_held_up: false }
+                StepPath { points: [from, from.midpoint(end), end], is_held_up: false }
             } else {
                 avoid_blocks(&pads_before, &pads(to, &then), blocks)
             };
-            held_up.push(way.is_held_up);
+            held_up.push(path.is_held_up);
             let openings = if opening < before {
                 [before, before, before, opening]
             } else {
                 [before, 0.5 * (before + opening), opening, opening]
             };
-            let [rise, corner, end] = way.points;
+            let [rise, corner, end] = path.points;
             for ((waypoint, point), opening) in
                 step.iter_mut().zip([rise, corner, end, end]).zip(openings)
             {
