@@ -26,7 +26,7 @@ const SET_DOWN_M: f64 = 0.002;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ObservedBlock {
     /// The centre, metres.
-    pub(crate) at: DVec3,
+    pub(crate) position: DVec3,
     /// The rotation about the vertical axis, radians.
     pub(crate) yaw_rad: f64,
     /// Half the edges, along the block's own axes, metres.
@@ -109,18 +109,18 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
 impl ObservedBlock {
     /// The distance by which the block can be lowered, metres.
     fn room_m(&self) -> f64 {
-        (self.at.z - self.half_m.z - SET_DOWN_M).max(0.0)
+        (self.position.z - self.half_m.z - SET_DOWN_M).max(0.0)
     }
 
     fn top_m(&self) -> f64 {
-        self.at.z + self.half_m.z
+        self.position.z + self.half_m.z
     }
 }
 
 impl Pads {
     /// Returns whether the pads hold `block`.
     fn hold(&self, block: &ObservedBlock) -> bool {
-        let offset = block.at - self.centre;
+        let offset = block.position - self.centre;
         let longer_m = (block.half_m.x - block.half_m.y).max(0.0);
         self.commanded_m <= block.half_m.y
             && offset.truncate().length() < HELD_WITHIN_M + longer_m
@@ -158,7 +158,7 @@ impl Body {
     /// `block`, displaced by `by`.
     fn at(block: &ObservedBlock, by: DVec3) -> Self {
         let axes = DMat3::from_rotation_z(block.yaw_rad);
-        Self { centre: block.at + by, axes, half_m: block.half_m }
+        Self { centre: block.position + by, axes, half_m: block.half_m }
     }
 
     /// The height of the lowest corner.
@@ -180,7 +180,7 @@ impl Body {
         let cube =
             Rectangle { along: direction(block.yaw_rad), half: block.half_m.truncate() + BESIDE_M };
         let closing = self.axes.x_axis.truncate().normalize_or(DVec2::X);
-        let apart = (block.at - self.centre).truncate();
+        let apart = (block.position - self.centre).truncate();
         [closing, closing.perp(), cube.along, cube.along.perp()].into_iter().all(|axis| {
             apart.dot(axis).abs() < self.half_width_m(axis.extend(0.0)) + cube.half_width_m(axis)
         })
@@ -224,7 +224,7 @@ mod tests {
     use super::*;
 
     const BLOCK: ObservedBlock = ObservedBlock {
-        at: DVec3::new(0.1, 0.0, 0.028),
+        position: DVec3::new(0.1, 0.0, 0.028),
         yaw_rad: 0.0,
         half_m: DVec3::splat(0.028),
     };
@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn a_held_block_passes_over_another_one() {
         let from = DVec3::new(0.1, 0.07, 0.09);
-        let held = ObservedBlock { at: from, ..BLOCK };
+        let held = ObservedBlock { position: from, ..BLOCK };
         let holding = |centre| Pads { commanded_m: 0.0, ..pads(centre, 0.028) };
         let to = DVec3::new(0.1, 0.0, 0.05);
         let path = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
@@ -312,8 +312,12 @@ mod tests {
 
     #[test]
     fn a_block_that_a_hand_does_not_cross_does_not_change_its_path() {
-        let far = ObservedBlock { at: BLOCK.at + DVec3::Y * 0.3, ..BLOCK };
-        let high = ObservedBlock { half_m: DVec3::splat(0.04), at: BLOCK.at.with_z(0.04), ..BLOCK };
+        let far = ObservedBlock { position: BLOCK.position + DVec3::Y * 0.3, ..BLOCK };
+        let high = ObservedBlock {
+            half_m: DVec3::splat(0.04),
+            position: BLOCK.position.with_z(0.04),
+            ..BLOCK
+        };
         let from = DVec3::new(0.03, 0.0, 0.072);
         let path = |blocks: &[ObservedBlock]| {
             avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.08, 0.0, 0.03), 0.0), blocks)
@@ -327,7 +331,7 @@ mod tests {
 
     #[test]
     fn a_held_block_is_lowered_to_the_table_and_no_further() {
-        let held = ObservedBlock { at: BLOCK.at.with_z(0.06), ..BLOCK };
+        let held = ObservedBlock { position: BLOCK.position.with_z(0.06), ..BLOCK };
         let from = DVec3::new(0.1, 0.005, 0.07);
         let path = |opening_m, to, block| {
             avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block])

@@ -56,7 +56,7 @@ struct WantedStep<'a> {
 /// The state of the closed loop.
 struct LoopState {
     /// The commanded joint angles, radians.
-    at: Vec<Joints>,
+    joint_angles: Vec<Joints>,
     /// The commanded openings, metres on each side.
     openings_m: Vec<f64>,
     /// The velocities of the training world's hands, arm frames, metres per second.
@@ -84,15 +84,15 @@ struct LoopState {
 }
 
 impl<'a, 'rig> ClosedLoop<'a, 'rig> {
-    /// Starts the closed loop of `runner` with the arms at joint angles `at` (radians), those of `start`.
+    /// Starts the closed loop of `runner` with the arms at `joint_angles` (radians), those of `start`.
     pub(super) fn new(
         runner: &'a TrialRunner,
         rig: &'a mut TrialRig<'rig>,
         start: &'a TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         policy: &'a mut dyn ActionSource,
     ) -> Self {
-        let state = LoopState::new(start, at);
+        let state = LoopState::new(start, joint_angles);
         Self { runner, rig, start, policy, state, n_steps: 0, n_shortened: 0, timed_out: false }
     }
 
@@ -126,9 +126,9 @@ impl<'a, 'rig> ClosedLoop<'a, 'rig> {
                 .copy_from_slice(&self.start.goals[arm.0].as_vec3().to_array());
         }
         let meets = layout.arms().all(|arm| runner.task.arm_meets_conditions(arm, &observation));
-        let at: Vec<DVec3> = now.iter().map(|now| now.object).collect();
+        let positions: Vec<DVec3> = now.iter().map(|now| now.object).collect();
         let misplaced: Vec<bool> = runner.misplaced(&objects, self.start).collect();
-        state.progress.see(&at, &misplaced);
+        state.progress.see(&positions, &misplaced);
         state.count_done(&now, &self.start.goals, runner.tolerance_m(), meets);
         state.carries = runner.task.shares_object()
             && layout.arms().any(|arm| runner.task.arm_holds(arm, &observation));
@@ -181,7 +181,7 @@ impl TrialRunner {
         let Some(shared) = shared else {
             let half_m = DVec3::splat(self.config.block.half_m.into());
             let block = |object: &ObjectPose| ObservedBlock {
-                at: object.at_m,
+                position: object.at_m,
                 yaw_rad: yaw_rad(object),
                 half_m,
             };
@@ -197,7 +197,7 @@ impl TrialRunner {
             let arm = (0..objects.len()).min_by(nearer).unwrap_or(0);
             let object = &objects[arm];
             ObservedBlock {
-                at: object.at_m + object.orientation * offset(arm),
+                position: object.at_m + object.orientation * offset(arm),
                 yaw_rad: yaw_rad(object),
                 half_m: double(part.half_extents_m),
             }
@@ -207,20 +207,20 @@ impl TrialRunner {
 }
 
 impl LoopState {
-    /// The state at the start of a trial, at joint angles `at`, radians.
-    fn new(start: &TrialStart, at: &[Joints]) -> Self {
+    /// The state at the start of a trial, at `joint_angles`, radians.
+    fn new(start: &TrialStart, joint_angles: &[Joints]) -> Self {
         Self {
-            at: at.to_vec(),
-            openings_m: vec![start.opening_m; at.len()],
-            velocities: vec![DVec3::ZERO; at.len()],
+            joint_angles: joint_angles.to_vec(),
+            openings_m: vec![start.opening_m; joint_angles.len()],
+            velocities: vec![DVec3::ZERO; joint_angles.len()],
             before: None,
             n_done: 0,
             n_in_success: 0,
             carries: false,
-            progress: Progress::new(at.len()),
-            narrow: vec![false; at.len()],
+            progress: Progress::new(joint_angles.len()),
+            narrow: vec![false; joint_angles.len()],
             withdraw: None,
-            parked: vec![false; at.len()],
+            parked: vec![false; joint_angles.len()],
             n_waits: 0,
             noise: None,
             waypoints: Vec::new(),

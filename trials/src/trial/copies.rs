@@ -28,7 +28,7 @@ impl TrialRunner {
     pub(super) fn n_failed_copies(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         planned: &PlannedMotion,
         max_failed: usize,
     ) -> Result<Option<usize>, TrialError> {
@@ -36,7 +36,7 @@ impl TrialRunner {
         let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * FIRST_NOISE));
         for (friction, noise) in FRICTIONS.into_iter().zip(noises) {
             let simulated = with_friction(&self.config.simulated, friction);
-            let pair = self.pair(start, at, noise, &simulated);
+            let pair = self.pair(start, joint_angles, noise, &simulated);
             n_failed += usize::from(!self.succeeds_on(pair, start, planned)?);
             if n_failed > max_failed {
                 return Ok(None);
@@ -66,18 +66,18 @@ impl TrialRunner {
     pub(super) fn rehearse_on_copy(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         friction: f32,
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
         let simulated = without_noise(&with_friction(&self.config.simulated, friction));
-        let pair = self.pair(start, at, start.number, &simulated);
+        let pair = self.pair(start, joint_angles, start.number, &simulated);
         let (execution, ends) = self.on(pair, |rig| {
-            let execution = ClosedLoop::new(self, rig, start, at, policy).run();
+            let execution = ClosedLoop::new(self, rig, start, joint_angles, policy).run();
             (execution, rig.pair().objects())
         })?;
         let (waypoints, motion) = match execution.ended {
-            Ok(()) => self.blind_motion(execution.waypoints, at),
+            Ok(()) => self.blind_motion(execution.waypoints, joint_angles),
             Err(cause) => (Vec::new(), Err(FailureCause::NotRehearsed(Box::new(cause)))),
         };
         Ok(PlannedMotion {
@@ -146,11 +146,12 @@ mod tests {
         let tools = |hands: &[DVec3]| runner.waypoint(hands, &[0.0; 2], &near).unwrap();
         let raised: Vec<DVec3> = start.hands.iter().map(|hand| *hand + DVec3::Z * 0.02).collect();
         let waypoints = vec![tools(&start.hands), tools(&raised)];
-        let at = start_angles(&runner.mapping, &start).unwrap();
-        let (waypoints, motion) = runner.blind_motion(waypoints, &at);
+        let joint_angles = start_angles(&runner.mapping, &start).unwrap();
+        let (waypoints, motion) = runner.blind_motion(waypoints, &joint_angles);
         let idle = PlannedMotion { waypoints, motion, rehearsed_m: vec![0.0; 2], n_steps: 1 };
-        let n_failed =
-            |start, max_failed| runner.n_failed_copies(start, &at, &idle, max_failed).unwrap();
+        let n_failed = |start, max_failed| {
+            runner.n_failed_copies(start, &joint_angles, &idle, max_failed).unwrap()
+        };
         assert_eq!(n_failed(&start, usize::MAX), Some(FRICTIONS.len()));
         assert_eq!(n_failed(&start, 1), None);
         let solved = TrialStart { goals: start.objects.clone(), ..start.clone() };

@@ -221,13 +221,13 @@ impl<'a> TrialRig<'a> {
         }
         let time_s = self.n_periods as f64 * PERIOD_S;
         let planned = self.executor.reference();
-        let at = |angles: &[Joints]| tool_positions(&self.cell, angles);
+        let tools_at = |angles: &[Joints]| tool_positions(&self.cell, angles);
         let n_arms = self.cell.arms.len();
         let angles: Vec<Joints> = (0..n_arms).map(|arm| *pair.angles(ArmIndex(arm))).collect();
         let tools = PathPoint {
             time_s,
-            planned: planned.map(at).unwrap_or_default(),
-            measured: at(&angles),
+            planned: planned.map(tools_at).unwrap_or_default(),
+            measured: tools_at(&angles),
         };
         let goals = self.goals.at_m.iter().map(|goal| goal.as_vec3().to_array()).collect();
         let goal_tolerance_m = self.goals.tolerance_m;

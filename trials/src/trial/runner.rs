@@ -104,20 +104,22 @@ impl TrialRunner {
         observer: &mut dyn TrialObserver,
     ) -> Result<TrialReport, TrialError> {
         let start = self.start(number)?;
-        let at = start_angles(&self.mapping, &start)?;
+        let joint_angles = start_angles(&self.mapping, &start)?;
         let planned = match self.config.mode {
-            TrialMode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
-            TrialMode::Twin => Some(self.rehearse_on_copy(&start, &at, TWIN_FRICTION, policy)?),
+            TrialMode::OpenLoop => Some(self.rehearse(&start, &joint_angles, policy)?),
+            TrialMode::Twin => {
+                Some(self.rehearse_on_copy(&start, &joint_angles, TWIN_FRICTION, policy)?)
+            }
             TrialMode::ClosedLoop => None,
         };
-        let pair = self.pair(&start, &at, number, &self.config.simulated);
+        let pair = self.pair(&start, &joint_angles, number, &self.config.simulated);
         let initial: Vec<ObjectPose> = pair.objects();
         let at_m = self.in_world(&start.goals);
         let goals = Goals { at_m, tolerance_m: self.task.tolerance() };
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
             Some(motion) => self.open_loop(&mut rig, &start, motion),
-            None => ClosedLoop::new(self, &mut rig, &start, &at, policy).run(),
+            None => ClosedLoop::new(self, &mut rig, &start, &joint_angles, policy).run(),
         };
         Ok(self.report(number, &start, &initial, &rig, execution))
     }
@@ -204,15 +206,15 @@ impl TrialRunner {
         })
     }
 
-    /// Plans the motion through `waypoints` from joint angles `at` (radians) and checks it with `settings`.
+    /// Plans the motion through `waypoints` from `joint_angles` (radians) and checks it with `settings`.
     pub(super) fn motion(
         &self,
         waypoints: &[Waypoint],
-        at: &[Joints],
+        joint_angles: &[Joints],
         settings: &CheckSettings,
     ) -> Result<Motion, FailureCause> {
         let cell = self.mapping.cell();
-        let planned = plan(cell, waypoints, at, &PlanSettings::default());
+        let planned = plan(cell, waypoints, joint_angles, &PlanSettings::default());
         let trajectory =
             planned.map_err(|error| FailureCause::Refused(MotionRefusal::Plan(error)))?;
         let motion = trajectory.sampled(RATE_HZ);
@@ -245,9 +247,10 @@ impl TrialRunner {
         let Self { mapping, check, .. } = self;
         let is_free = |start: &TrialStart| {
             // An arm that cannot reach the start is reported later.
-            start_angles(mapping, start).map_or(true, |at| {
-                mapping.cell().gaps(&at).arms_m >= check.arms_gap_m
-                    && mapping.cell().arms.iter().zip(&at).all(|(placed, at)| has_range(placed, at))
+            start_angles(mapping, start).map_or(true, |joint_angles| {
+                let mut arms = mapping.cell().arms.iter().zip(&joint_angles);
+                mapping.cell().gaps(&joint_angles).arms_m >= check.arms_gap_m
+                    && arms.all(|(placed, angles)| has_range(placed, angles))
             })
         };
         self.rehearsal.start(self.config.seed, number, is_free)
@@ -263,13 +266,13 @@ impl TrialRunner {
     pub(super) fn pair(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         number: u64,
         simulated: &SimulatedConfig,
     ) -> SimulatedPair {
-        let block = |(at, yaw_rad): (DVec3, &f64)| {
-            let (at, yaw_rad) = (at.as_vec3(), single(*yaw_rad));
-            Block { at_m: [at.x, at.y], yaw_rad, ..self.config.block }
+        let block = |(position, yaw_rad): (DVec3, &f64)| {
+            let (position, yaw_rad) = (position.as_vec3(), single(*yaw_rad));
+            Block { at_m: [position.x, position.y], yaw_rad, ..self.config.block }
         };
         let points = self.in_world(&start.objects);
         let shared = start.shared.clone().map(|shared| placed(shared, &points));
@@ -284,13 +287,13 @@ impl TrialRunner {
             ..simulated.clone()
         };
         let opening = self.mapping.opening(start.opening_m);
-        SimulatedPair::new(self.mapping.cell().clone(), at, opening, config)
+        SimulatedPair::new(self.mapping.cell().clone(), joint_angles, opening, config)
     }
 }
 
 /// Returns whether every joint keeps [`RANGE_ROOM_RAD`] to the ends of its range.
-fn has_range(placed: &PlacedArm, at: &Joints) -> bool {
-    placed.model.joints.iter().zip(at.iter()).all(|(joint, angle)| {
+fn has_range(placed: &PlacedArm, angles: &Joints) -> bool {
+    placed.model.joints.iter().zip(angles.iter()).all(|(joint, angle)| {
         let [low, high] = joint.range_rad;
         (angle - low).min(high - angle) >= RANGE_ROOM_RAD
     })
@@ -329,10 +332,10 @@ mod tests {
         let mut runner = TrialRunner::new(config).unwrap();
         for number in 0..50 {
             let start = runner.start(number).unwrap();
-            for at in start_angles(&runner.mapping, &start).unwrap() {
+            for angles in start_angles(&runner.mapping, &start).unwrap() {
                 let elbow = &runner.mapping.cell().arms[0].model.joints[2];
-                let [low, high] = elbow.range_rad.map(|end| (at[2] - end).abs());
-                assert!(low.min(high) > least_rad, "trial {number}: {at:?}");
+                let [low, high] = elbow.range_rad.map(|end| (angles[2] - end).abs());
+                assert!(low.min(high) > least_rad, "trial {number}: {angles:?}");
             }
         }
     }

@@ -20,12 +20,12 @@ pub(crate) fn shared_object(world: &WorldDescription, shown: &[Cuboid]) -> Share
     });
     let rotation =
         shown.first().map_or(Quat::IDENTITY, |first| Quat::from_array(first.orientation));
-    let at = match (shown.first(), points.first()) {
+    let position = match (shown.first(), points.first()) {
         (Some(first), Some(point)) => Vec3::from(first.centre) - rotation * *point,
         _ => Vec3::ZERO,
     };
     let in_body = |shown: &Cuboid| Cuboid {
-        centre: (rotation.inverse() * (Vec3::from(shown.centre) - at)).to_array(),
+        centre: (rotation.inverse() * (Vec3::from(shown.centre) - position)).to_array(),
         orientation: (rotation.inverse() * Quat::from_array(shown.orientation)).to_array(),
         half_extents_m: shown.half_extents_m,
     };
@@ -34,7 +34,7 @@ pub(crate) fn shared_object(world: &WorldDescription, shown: &[Cuboid]) -> Share
         boxes: boxes.collect(),
         shown: shown.iter().map(in_body).collect(),
         points_m: points.iter().map(Vec3::to_array).collect(),
-        at_m: at.to_array(),
+        at_m: position.to_array(),
         yaw_rad: libm::atan2f(ahead.y, ahead.x),
     }
 }
@@ -47,8 +47,8 @@ pub(crate) fn placed(object: SharedObject, points: &[DVec3]) -> SharedObject {
     let (along, middle) = ((*to - *from).as_vec3(), from.midpoint(*to).as_vec3());
     let yaw_rad = libm::atan2f(along.y, along.x) - libm::atan2f(in_body.y, in_body.x);
     let middle_in_body = Vec3::from(*first).midpoint(Vec3::from(*second));
-    let at = middle - rotation_about_z(yaw_rad) * middle_in_body;
-    SharedObject { at_m: at.to_array(), yaw_rad, ..object }
+    let position = middle - rotation_about_z(yaw_rad) * middle_in_body;
+    SharedObject { at_m: position.to_array(), yaw_rad, ..object }
 }
 
 fn rotation_about_z(yaw_rad: f32) -> Quat {

@@ -250,8 +250,8 @@ mod tests {
         let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         state.parked[1] = true;
         let hands = runner.hands(&state);
         let moved: Vec<DVec3> = hands.iter().map(|hand| *hand + DVec3::X * 0.05).collect();
@@ -267,8 +267,8 @@ mod tests {
         let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let objects = |distances_m: [f64; 2]| {
             let pose = |(arm, distance_m): (usize, f64)| {
                 let in_arm = start.goals[arm] + DVec3::X * distance_m;
@@ -308,8 +308,8 @@ mod tests {
         let mut runner = TrialRunner::new(config).unwrap();
         let mut start = runner.start(0).unwrap();
         start.goals[0].z = 0.15;
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let in_arm = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
         let pose = |arm: usize| {
             let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm[arm]);

@@ -209,8 +209,8 @@ mod tests {
     fn a_held_object_looks_as_in_the_training_world() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let half_m = runner.config.trained_half_m;
         let object = DVec3::new(0.1, 0.0, 0.03);
         // Held by two edges, so that the gripper is further open than the object is wide.
@@ -229,8 +229,8 @@ mod tests {
     fn a_gripper_that_another_object_holds_up_becomes_narrow() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let object = DVec3::new(0.1, 0.0, 0.03);
         let above = seen(object.with_z(0.1), object);
         let mut opening_m = |now: ArmObservation| {

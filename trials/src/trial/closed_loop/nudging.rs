@@ -53,7 +53,7 @@ impl ClosedLoop<'_, '_> {
         if !runner.config.layout.task.grasps() || runner.task.shares_object() {
             return Ok(());
         }
-        let mut arms = 0..state.at.len();
+        let mut arms = 0..state.joint_angles.len();
         let Some(arm) = arms.find(|arm| state.progress.n_held_up(*arm) >= N_HELD_UP) else {
             return Ok(());
         };
@@ -151,13 +151,13 @@ impl TrialRunner {
         let corner_m = std::f64::consts::SQRT_2 * half_m;
         pushes.into_iter().find_map(|(pushed, along)| {
             let beside = object - apart;
-            let (at, rests) = if pushed == arm { (object, beside) } else { (beside, object) };
+            let (position, rests) = if pushed == arm { (object, beside) } else { (beside, object) };
             let push = Push {
-                from: at - along * (corner_m + PADS_M + GAP_M),
-                to: at + along * (PUSH_M - half_m - PADS_M),
+                from: position - along * (corner_m + PADS_M + GAP_M),
+                to: position + along * (PUSH_M - half_m - PADS_M),
             };
             let has_room = (rests - push.from).truncate().length() > corner_m + PADS_M;
-            let then = self.mapping.object_in_world(ArmIndex(arm), at + along * PUSH_M);
+            let then = self.mapping.object_in_world(ArmIndex(arm), position + along * PUSH_M);
             let then = self.mapping.object_in_arm(ArmIndex(pushed), then);
             let is_reached = self.is_reached(push.from) && self.is_reached(push.to);
             (has_room && is_reached && self.is_reached(then)).then_some(push)
@@ -167,14 +167,14 @@ impl TrialRunner {
     /// The horizontal direction across the closing direction of the hand of `arm`, arm frame.
     pub(super) fn across(&self, arm: usize, state: &LoopState) -> DVec3 {
         let placed = &self.mapping.cell().arms[arm];
-        let in_world = tool_axes(placed, &state.at[arm]).y_axis;
+        let in_world = tool_axes(placed, &state.joint_angles[arm]).y_axis;
         let in_arm = DQuat::from_rotation_z(-placed.yaw_rad) * in_world;
         in_arm.with_z(0.0).normalize_or(DVec3::X)
     }
 
-    /// Returns whether hands reach the place above or at `at`, arm frame, metres.
-    pub(super) fn is_reached(&self, at: DVec3) -> bool {
-        (self.mapping.reachable_hand(at) - at).truncate().length() < REACH_M
+    /// Returns whether hands reach the place above or at `position`, arm frame, metres.
+    pub(super) fn is_reached(&self, position: DVec3) -> bool {
+        (self.mapping.reachable_hand(position) - position).truncate().length() < REACH_M
     }
 }
 
@@ -190,8 +190,8 @@ mod tests {
         let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let state = LoopState::new(&start, &joint_angles);
         let hand = runner.hands(&state)[0];
         let half_m = f64::from(runner.config.block.half_m);
         let object = hand.with_z(half_m);

@@ -33,7 +33,7 @@ impl ClosedLoop<'_, '_> {
             }
             for (arm, push) in runner.recalls(owner, &objects, start.goals[owner.0]) {
                 let is_pushed = self.carry_out(arm, &objects, &push)?;
-                let mut pushing = vec![false; self.state.at.len()];
+                let mut pushing = vec![false; self.state.joint_angles.len()];
                 pushing[arm] = true;
                 self.retreat(&pushing)?;
                 if is_pushed {
@@ -52,8 +52,9 @@ impl TrialRunner {
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
         let object = self.mapping.object_in_arm(owner, objects[owner.0].at_m);
         let away_m = if self.config.layout.task.grasps() { EDGE_M } else { AHEAD_M };
-        let is_at_hand =
-            |at: DVec3| self.is_reached(at - (goal - at).with_z(0.0).normalize_or_zero() * away_m);
+        let is_at_hand = |position: DVec3| {
+            self.is_reached(position - (goal - position).with_z(0.0).normalize_or_zero() * away_m)
+        };
         if is_at_hand(object) {
             return Vec::new();
         }
@@ -72,8 +73,8 @@ impl TrialRunner {
             let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
             recalls.extend((0..objects.len()).map(|arm| {
                 let seen = |in_arm| {
-                    let at = self.mapping.object_in_world(owner, in_arm);
-                    self.mapping.object_in_arm(ArmIndex(arm), at)
+                    let position = self.mapping.object_in_world(owner, in_arm);
+                    self.mapping.object_in_arm(ArmIndex(arm), position)
                 };
                 (arm, Push { from: seen(from), to: seen(to) })
             }));

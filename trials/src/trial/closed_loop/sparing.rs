@@ -134,7 +134,9 @@ impl TrialRunner {
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
         let then = self.mapping.object_in_arm(ArmIndex(other), then);
         let behind = (then - others).normalize_or_zero() * self.behind_m();
-        let beyond = |at: DVec3| beyond_m(at + behind, self.mapping.reachable_hand(at + behind));
+        let beyond = |position: DVec3| {
+            beyond_m(position + behind, self.mapping.reachable_hand(position + behind))
+        };
         beyond(then) > beyond(others) + BEYOND_M
     }
 
@@ -145,9 +147,9 @@ impl TrialRunner {
     }
 }
 
-/// Returns by how far `at` is beyond what hands reach according to `reachable`, horizontally, metres.
-fn beyond_m(at: DVec3, reachable: DVec3) -> f64 {
-    (at - reachable).truncate().length()
+/// Returns by how far `position` is beyond what hands reach according to `reachable`, horizontally, metres.
+fn beyond_m(position: DVec3, reachable: DVec3) -> f64 {
+    (position - reachable).truncate().length()
 }
 
 #[cfg(test)]
@@ -180,8 +182,8 @@ pub(super) mod tests {
     fn spared_toward(goal: DVec3, task: Task, now: ArmObservation, to: DVec3) -> (DVec3, f64) {
         let mut runner = runner(task);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         state.openings_m = vec![0.05; 2];
         let mut wanted = WantedStep { hands: vec![to; 2], openings_m: vec![0.03; 2], blocks: &[] };
         runner.spare_objects(&mut state, &[now, now], &[goal; 2], &mut wanted);
@@ -194,8 +196,8 @@ pub(super) mod tests {
         let pushed = |task, above_m: f64| {
             let mut runner = runner(task);
             let start = runner.start(0).unwrap();
-            let at = runner.mapping.cell().ready(0.2).unwrap();
-            let mut state = LoopState::new(&start, &at);
+            let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+            let mut state = LoopState::new(&start, &joint_angles);
             let across = runner.across(0, &state);
             let pad = DVec3::new(-across.y, across.x, 0.0) * 0.055;
             let hand = DVec3::new(0.1, 0.0, 0.03 + above_m);
@@ -220,8 +222,8 @@ pub(super) mod tests {
     fn a_hand_rises_instead_of_pushing_an_object_out_of_its_arms_reach() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         // As far from the second arm as its hand reaches, seen from the first arm, toward whose base the hand moves.
         let farthest = runner.mapping.reachable_hand(DVec3::new(1.0, 0.0, 0.03));
         let in_world = runner.mapping.object_in_world(ArmIndex(1), farthest);

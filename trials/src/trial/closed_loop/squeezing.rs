@@ -45,7 +45,7 @@ fn room_m(one: DVec3, other: DVec3, blocks: &[ObservedBlock]) -> Option<f64> {
 /// Returns the share of the line between two points that is within `block`.
 fn share_within(one: DVec3, other: DVec3, block: &ObservedBlock) -> f64 {
     let local = |point: DVec3| {
-        let offset = point - block.at;
+        let offset = point - block.position;
         direction(-block.yaw_rad).rotate(offset.truncate()).extend(offset.z).to_array()
     };
     let (from, to, half) = (local(one), local(other), block.half_m.to_array());
@@ -66,8 +66,11 @@ mod tests {
 
     use super::*;
 
-    const BLOCK: ObservedBlock =
-        ObservedBlock { at: DVec3::new(0.1, 0.0, 0.03), yaw_rad: 0.0, half_m: DVec3::splat(0.03) };
+    const BLOCK: ObservedBlock = ObservedBlock {
+        position: DVec3::new(0.1, 0.0, 0.03),
+        yaw_rad: 0.0,
+        half_m: DVec3::splat(0.03),
+    };
 
     #[test]
     fn room_is_what_the_blocks_leave_of_the_line_from_hand_to_hand() {
@@ -77,7 +80,7 @@ mod tests {
             assert!(got.is_some_and(|got| (got - wanted).abs() < 1e-12), "{got:?}, not {wanted}");
         };
         near(room(hand(0.0, 0.03), hand(0.2, 0.03), &[BLOCK]), 0.14);
-        let second = ObservedBlock { at: hand(0.165, 0.03), ..BLOCK };
+        let second = ObservedBlock { position: hand(0.165, 0.03), ..BLOCK };
         near(room(hand(0.05, 0.03), hand(0.21, 0.03), &[BLOCK, second]), 0.04);
         let turned = ObservedBlock { yaw_rad: FRAC_PI_4, ..BLOCK };
         near(room(hand(0.0, 0.03), hand(0.2, 0.03), &[turned]), 0.2 - 0.06 * SQRT_2);

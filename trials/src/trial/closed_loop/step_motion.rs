@@ -111,7 +111,9 @@ impl ClosedLoop<'_, '_> {
         }
         let [rise, corner, end, last] = step;
         let waypoints = [first.clone(), rise, corner, end, last];
-        let Ok(motion) = runner.motion(&waypoints, &state.at, check) else { return Ok(false) };
+        let Ok(motion) = runner.motion(&waypoints, &state.joint_angles, check) else {
+            return Ok(false);
+        };
         let ends: Vec<Joints> =
             motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
         let played = if state.carries {
@@ -125,7 +127,7 @@ impl ClosedLoop<'_, '_> {
             played => played?,
         };
         if is_whole {
-            state.at = ends;
+            state.joint_angles = ends;
             state.openings_m.clone_from(&wanted.openings_m);
             state.append_waypoints(waypoints);
         } else {
@@ -139,7 +141,7 @@ impl TrialRunner {
     /// Returns the tools at the commanded angles, with the commanded openings.
     pub(super) fn tools(&self, state: &LoopState) -> Waypoint {
         let openings = state.openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m));
-        tool_positions(self.mapping.cell(), &state.at)
+        tool_positions(self.mapping.cell(), &state.joint_angles)
             .iter()
             .zip(openings)
             .map(|(tool, opening)| ArmWaypoint {
@@ -151,17 +153,18 @@ impl TrialRunner {
 
     /// The end effectors at the commanded angles, arm frames, metres.
     pub(super) fn hands(&self, state: &LoopState) -> Vec<DVec3> {
-        let arms = state.at.iter().enumerate();
-        arms.map(|(arm, at)| self.mapping.hand_in_arm(ArmIndex(arm), at)).collect()
+        let arms = state.joint_angles.iter().enumerate();
+        arms.map(|(arm, angles)| self.mapping.hand_in_arm(ArmIndex(arm), angles)).collect()
     }
 
     /// Returns the positions of the hands (arm frames, metres) in which two arms are farther apart than `from`, farthest
     /// first.
     fn positions_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
         let gap_m = |hands: &[DVec3]| {
-            let reached = hands.iter().zip(&state.at).enumerate().map(|(arm, (hand, near))| {
-                self.mapping.tool_in_world(ArmIndex(arm), *hand, near).map(|(_, angles)| angles)
-            });
+            let reached =
+                hands.iter().zip(&state.joint_angles).enumerate().map(|(arm, (hand, near))| {
+                    self.mapping.tool_in_world(ArmIndex(arm), *hand, near).map(|(_, angles)| angles)
+                });
             let angles: Result<Vec<Joints>, ReachError> = reached.collect();
             angles.map_or(f64::NEG_INFINITY, |angles| self.mapping.cell().gaps(&angles).arms_m)
         };
@@ -212,7 +215,7 @@ impl TrialRunner {
         let mut held_up = Vec::new();
         let arms = self.mapping.cell().arms.iter().zip(measured).enumerate();
         for (arm, (placed, measured)) in arms {
-            let (idx, near) = (ArmIndex(arm), &state.at[arm]);
+            let (idx, near) = (ArmIndex(arm), &state.joint_angles[arm]);
             let [before, opening] = [state.openings_m[arm], openings_m[arm]]
                 .map(|opening_m| self.mapping.opening(opening_m));
             let [from, to] =

@@ -22,7 +22,7 @@ impl ClosedLoop<'_, '_> {
         let (mapping, state) = (&self.runner.mapping, &mut self.state);
         let forces_n = self.rig.forces_n();
         for (arm, (angles, opening)) in self.rig.encoders().into_iter().enumerate() {
-            state.at[arm] = angles;
+            state.joint_angles[arm] = angles;
             let opening_m = mapping.policy_opening_m(opening);
             // A gripper that holds something keeps its grip, unless its hand presses on something.
             let grips = state.openings_m[arm] < opening_m - GRIPPED_M;
