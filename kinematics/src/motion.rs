@@ -9,7 +9,7 @@ pub struct ArmSample {
     pub angles: Joints,
     /// Joint velocities, radians per second.
     pub velocities: Joints,
-    /// Opening of the gripper: 0 is shut, 1 open.
+    /// Opening of the gripper: 0 is closed, 1 open.
     pub gripper_opening: f64,
 }
 

@@ -55,7 +55,7 @@ impl PlacedArm {
         let forward = ForwardKinematics::new(self.model, angles);
         let world_from_base = self.world_from_base();
         let point = |anchor: &Anchor| single(&(world_from_base * forward.anchor_m(anchor)));
-        let links = self.model.links.iter().filter(|link| is_rigid(link.shut_share));
+        let links = self.model.links.iter().filter(|link| is_rigid(link.closed_share));
         let n_joints = angles.len();
         ArmScene {
             base: single(&self.base_in_world_m),
@@ -79,8 +79,8 @@ impl PlacedArm {
 }
 
 /// Returns whether a part has the same shape at every opening. The gripper is drawn as fingers instead.
-fn is_rigid(shut_share: f64) -> bool {
-    shut_share >= 1.0
+fn is_rigid(closed_share: f64) -> bool {
+    closed_share >= 1.0
 }
 
 /// Returns the shell of the hand and its two fingers, which move along the tool's x axis.

@@ -38,7 +38,7 @@ pub struct ArmState {
     pub velocities: Joints,
     /// Joint accelerations, radians per second squared.
     pub accelerations: Joints,
-    /// Opening of the gripper: 0 is shut, 1 open.
+    /// Opening of the gripper: 0 is closed, 1 open.
     pub gripper_opening: f64,
     /// Rate of change of the opening, 1/s.
     pub gripper_opening_per_s: f64,

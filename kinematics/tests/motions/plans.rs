@@ -153,7 +153,7 @@ fn a_straight_line_uses_some_limit_almost_fully() {
     }
 }
 
-/// Returns waypoints of both arms on a line in the arm frames. The grippers are shut from the middle on.
+/// Returns waypoints of both arms on a line in the arm frames. The grippers are closed from the middle on.
 fn line(cell: &WorkCell, from: Point3<f64>, to: Point3<f64>, n: u32) -> Vec<Waypoint> {
     let at = |idx: u32| {
         let share = f64::from(idx) / f64::from(n - 1);

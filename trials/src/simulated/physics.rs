@@ -277,8 +277,8 @@ impl PhysicsWorld {
         ];
         let opening_m = opening * MAX_OPENING_M;
         let fingers = [1.0, -1.0].map(|side| {
-            let shut = Vector::new(side * PAD_HALF_M.x, 0.0, PAD_AHEAD_M);
-            let offset = shut + Vector::X * (side * opening_m);
+            let closed = Vector::new(side * PAD_HALF_M.x, 0.0, PAD_AHEAD_M);
+            let offset = closed + Vector::X * (side * opening_m);
             let pose = poses.hand() * Pose::from_parts(offset, Rotation::IDENTITY);
             let finger = self
                 .bodies
@@ -290,7 +290,7 @@ impl PhysicsWorld {
                 .collision_groups(groups(group, others));
             colliders.push(self.colliders.insert_with_parent(pad, finger, &mut self.bodies));
             let slide = PrismaticJointBuilder::new(Vector::X * side)
-                .local_anchor1(shut)
+                .local_anchor1(closed)
                 .local_anchor2(Vector::ZERO)
                 .contacts_enabled(false)
                 .limits([0.0, MAX_OPENING_M])
@@ -406,7 +406,7 @@ mod tests {
         let [from, to] = [0, 1].map(|end| DVec3::from(fingers.ends[end].offset_m));
         let middle = 0.5 * (from + to);
         for opening in [0.0_f32, 0.25, 0.5, 0.75, 1.0] {
-            let share = fingers.shut_share + f64::from(opening) * (1.0 - fingers.shut_share);
+            let share = fingers.closed_share + f64::from(opening) * (1.0 - fingers.closed_share);
             let [from, to] = [from, to].map(|end| middle + share * (end - middle));
             for corner in 0..8_u32 {
                 let side = |bit: u32| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 };
