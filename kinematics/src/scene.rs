@@ -17,7 +17,7 @@ const SHELL_BEHIND_M: f64 = 0.110;
 const FINGER_HALF_M: Vector3<f64> = Vector3::new(0.005, 0.008, 0.015);
 const FINGER_AHEAD_M: f64 = 0.021;
 /// Distance of an open finger from the middle, metres.
-const OPEN_M: f64 = 0.062;
+const OPEN_DISTANCE_M: f64 = 0.062;
 
 impl WorkCell {
     /// Returns the arms at joint angles `angles` (radians, arm by arm) with grippers open by `openings` (0 to 1, arm by
@@ -85,7 +85,7 @@ fn is_rigid(closed_share: f64) -> bool {
 
 /// Returns the shell of the hand and its two fingers, which move along the tool's x axis.
 fn hand(world_from_tool: &Isometry3<f64>, opening: f64) -> Vec<Cuboid> {
-    let aside_m = opening.clamp(0.0, 1.0) * OPEN_M + FINGER_HALF_M.x;
+    let aside_m = opening.clamp(0.0, 1.0) * OPEN_DISTANCE_M + FINGER_HALF_M.x;
     let parts = [
         (Point3::new(0.0, 0.0, -SHELL_BEHIND_M), SHELL_HALF_M),
         (Point3::new(-aside_m, 0.0, FINGER_AHEAD_M), FINGER_HALF_M),

@@ -11,16 +11,16 @@ use glam::{DMat3, DVec2, DVec3};
 /// Half extents of a pad: along the closing direction, across it, along the hand; metres.
 const PAD_HALF_M: DVec3 = DVec3::new(0.005, 0.008, 0.015);
 /// Distances that are kept beside and above a block, metres.
-const BESIDE_M: f64 = 0.003;
-const ABOVE_M: f64 = 0.004;
+const CLEARANCE_BESIDE_M: f64 = 0.003;
+const CLEARANCE_ABOVE_M: f64 = 0.004;
 /// Closed pads hold a block whose centre is horizontally within this distance, metres.
-const HELD_WITHIN_M: f64 = 0.025;
+const HOLDING_DISTANCE_M: f64 = 0.025;
 /// The number of parts of a step at whose ends pads are compared with a block.
 const N_PARTS: u32 = 8;
 /// A hand is held up if it ends this far above its wanted position, metres.
-const HELD_UP_M: f64 = 0.01;
+const HELD_UP_HEIGHT_M: f64 = 0.01;
 /// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
-const SET_DOWN_M: f64 = 0.002;
+const SET_DOWN_HEIGHT_M: f64 = 0.002;
 
 /// A block as observed, world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,7 +84,7 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
         from.crosses(&to, block) || bodies[2..].iter().any(|(one, then)| one.crosses(then, block))
     };
     for block in others.iter().filter(is_met) {
-        let over_m = block.top_m() + ABOVE_M;
+        let over_m = block.top_m() + CLEARANCE_ABOVE_M;
         let any_above = bodies.iter().any(|(before, _)| before.is_above(block));
         for (before, after) in &bodies {
             let crosses = || any_above && !before.overlaps(block) && before.crosses(after, block);
@@ -103,13 +103,13 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
     let highest_m = start.z + lift_m;
     let last = end.with_z(end.z.max(lowest_m.min(highest_m)));
     let points = [start.with_z(highest_m), last.with_z(highest_m), last];
-    StepPath { points, is_held_up: last.z > end.z + HELD_UP_M }
+    StepPath { points, is_held_up: last.z > end.z + HELD_UP_HEIGHT_M }
 }
 
 impl ObservedBlock {
     /// The distance by which the block can be lowered, metres.
     fn room_m(&self) -> f64 {
-        (self.position.z - self.half_m.z - SET_DOWN_M).max(0.0)
+        (self.position.z - self.half_m.z - SET_DOWN_HEIGHT_M).max(0.0)
     }
 
     fn top_m(&self) -> f64 {
@@ -123,7 +123,7 @@ impl Pads {
         let offset = block.position - self.centre;
         let longer_m = (block.half_m.x - block.half_m.y).max(0.0);
         self.commanded_m <= block.half_m.y
-            && offset.truncate().length() < HELD_WITHIN_M + longer_m
+            && offset.truncate().length() < HOLDING_DISTANCE_M + longer_m
             && offset.z.abs() < block.half_m.z
     }
 
@@ -167,7 +167,7 @@ impl Body {
     }
 
     fn is_above(&self, block: &ObservedBlock) -> bool {
-        self.lowest_m() >= block.top_m() - ABOVE_M
+        self.lowest_m() >= block.top_m() - CLEARANCE_ABOVE_M
     }
 
     /// Half the width along `axis`.
@@ -177,8 +177,10 @@ impl Body {
 
     /// Returns whether the body is above `block` or too near to it, seen from above.
     fn overlaps(&self, block: &ObservedBlock) -> bool {
-        let cube =
-            Rectangle { along: direction(block.yaw_rad), half: block.half_m.truncate() + BESIDE_M };
+        let cube = Rectangle {
+            along: direction(block.yaw_rad),
+            half: block.half_m.truncate() + CLEARANCE_BESIDE_M,
+        };
         let closing = self.axes.x_axis.truncate().normalize_or(DVec2::X);
         let apart = (block.position - self.centre).truncate();
         [closing, closing.perp(), cube.along, cube.along.perp()].into_iter().all(|axis| {
@@ -247,7 +249,7 @@ mod tests {
         );
         let closed = path(0.0, BLOCK);
         let end = closed.points[2];
-        assert!((end.z - (0.056 + PAD_HALF_M.z + ABOVE_M)).abs() < 1e-12, "{end}");
+        assert!((end.z - (0.056 + PAD_HALF_M.z + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{end}");
         assert!(closed.is_held_up);
         let turned = ObservedBlock { yaw_rad: std::f64::consts::FRAC_PI_4, ..BLOCK };
         assert_eq!(path(0.033, BLOCK).points[2], to);
@@ -266,7 +268,7 @@ mod tests {
         let [.., end] = avoid_blocks(&from, &to, &[BLOCK]).points;
         let lower = tilted(end).each().map(|pad| pad.lowest_m());
         assert!(lower[0] < lower[1] - 0.03, "{lower:?}");
-        assert!((lower[0] - (0.056 + ABOVE_M)).abs() < 1e-12, "{lower:?}");
+        assert!((lower[0] - (0.056 + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{lower:?}");
     }
 
     #[test]
@@ -292,7 +294,7 @@ mod tests {
         assert_eq!(is_above, [true, false]);
         let path = avoid_blocks(&from, &to, &[BLOCK]);
         let lowest_m = tilted(path.points[2]).each().map(|pad| pad.lowest_m());
-        assert!(lowest_m[1] >= 0.056 + ABOVE_M - 1e-12, "{lowest_m:?}");
+        assert!(lowest_m[1] >= 0.056 + CLEARANCE_ABOVE_M - 1e-12, "{lowest_m:?}");
         assert!(path.is_held_up);
     }
 
@@ -304,7 +306,7 @@ mod tests {
         let to = DVec3::new(0.1, 0.0, 0.05);
         let path = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
         let lowest_m = path.points[2].z - 0.028;
-        assert!((lowest_m - (0.056 + ABOVE_M)).abs() < 1e-12, "{lowest_m}");
+        assert!((lowest_m - (0.056 + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{lowest_m}");
         assert!(path.is_held_up);
         let alone = avoid_blocks(&holding(from), &holding(to), &[held]);
         assert_eq!(alone.points[2], to);
@@ -337,7 +339,7 @@ mod tests {
             avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block])
         };
         let [.., end] = path(0.02, from.with_z(0.03), held).points;
-        assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_M))).abs() < 1e-12, "{end}");
+        assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_HEIGHT_M))).abs() < 1e-12, "{end}");
         let [.., end] = path(0.05, from.with_z(0.04), BLOCK).points;
         assert!((end.z - 0.04).abs() < 1e-12, "nothing is held by an open gripper");
     }

@@ -12,7 +12,7 @@ use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{FailureCause, ObjectResult};
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{Goals, TrialRig};
-use crate::trial::robustness::USED_TOLERANCE;
+use crate::trial::robustness::USED_TOLERANCE_SHARE;
 use crate::trial::runner::TrialRunner;
 use crate::trial::{ActionSource, NoObserver, TrialError};
 
@@ -20,7 +20,7 @@ use crate::trial::{ActionSource, NoObserver, TrialError};
 pub(super) const FRICTIONS: [f32; 8] = [0.8, 1.2, 0.9, 1.1, 0.85, 1.15, 0.95, 1.05];
 /// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial has
 /// such a number.
-const FIRST_NOISE: u64 = 1 << 48;
+const NOISE_STRIDE: u64 = 1 << 48;
 
 impl TrialRunner {
     /// Executes a planned motion blindly on the copies of the pair. Returns the number of those on which it fails, or
@@ -33,7 +33,7 @@ impl TrialRunner {
         max_failed: usize,
     ) -> Result<Option<usize>, TrialError> {
         let mut n_failed = 0;
-        let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * FIRST_NOISE));
+        let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * NOISE_STRIDE));
         for (friction, noise) in FRICTIONS.into_iter().zip(noises) {
             let simulated = with_friction(&self.config.simulated, friction);
             let pair = self.pair(start, joint_angles, noise, &simulated);
@@ -56,7 +56,7 @@ impl TrialRunner {
             let execution = self.open_loop(rig, start, planned.clone());
             self.report(start.number, start, &initial, rig, execution)
         })?;
-        let near_m = USED_TOLERANCE * self.tolerance_m();
+        let near_m = USED_TOLERANCE_SHARE * self.tolerance_m();
         let is_near = |object: &ObjectResult| object.end.distance(object.goal) <= near_m;
         Ok(report.cause.is_none() && report.objects.iter().all(is_near))
     }

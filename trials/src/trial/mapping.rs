@@ -29,7 +29,7 @@ pub const TABLE_GAP_M: f64 = 0.006;
 pub const TRAINED_HALF_M: f64 = 0.0225;
 /// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above the
 /// table, metres.
-const WITHDRAWN_M: [f64; 2] = [-0.05, 0.20];
+const WITHDRAWN_POSITION_M: [f64; 2] = [-0.05, 0.20];
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
@@ -232,7 +232,11 @@ impl Mapping {
     /// the objects on the table; arm frame, metres.
     #[must_use]
     pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
-        self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))
+        self.hand.reachable(DVec3::new(
+            WITHDRAWN_POSITION_M[0],
+            0.5 * hand.y,
+            WITHDRAWN_POSITION_M[1],
+        ))
     }
 
     /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, shape

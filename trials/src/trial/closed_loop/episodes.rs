@@ -19,7 +19,7 @@ const DONE_OBSERVATIONS: usize = 5;
 /// An arm makes way when the steps that the arms did not carry out in full outnumber the others by this many.
 const MAX_BLOCKED: usize = 10;
 /// Height above the table, metres, below which an object lies on it.
-const LYING_M: f64 = 0.01;
+const LYING_HEIGHT_M: f64 = 0.01;
 /// Height by which a hand rises before it withdraws, metres.
 const RISE_M: f64 = 0.06;
 
@@ -203,7 +203,7 @@ impl TrialRunner {
     pub(super) fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
         objects.iter().enumerate().map(|(arm, object)| {
             let height_m = self.mapping.object_in_arm(ArmIndex(arm), object.at_m).z;
-            height_m - self.config.trained_half_m < LYING_M
+            height_m - self.config.trained_half_m < LYING_HEIGHT_M
         })
     }
 

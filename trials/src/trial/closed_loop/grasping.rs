@@ -6,27 +6,27 @@
 
 use glam::{DVec3, EulerRot};
 
-use super::sparing::{BETWEEN_M, HELD_M};
+use super::sparing::{BETWEEN_PADS_DISTANCE_M, HELD_DISTANCE_M};
 use super::{LoopState, WantedStep};
 use crate::trial::mapping::ArmObservation;
 use crate::trial::runner::TrialRunner;
 
 /// The point between the pads is at most this far above an object's centre when the pads are beside the object, metres.
-const BESIDE_M: f64 = 0.015;
+const BESIDE_HEIGHT_M: f64 = 0.015;
 /// Horizontal distance from a hand to an object that it may be about to grasp, metres.
-const NEAR_M: f64 = 0.08;
+const APPROACH_DISTANCE_M: f64 = 0.08;
 /// A hand that has been held up for this many steps is open no wider than its object needs.
-const N_WIDE: usize = 2;
+const N_WIDE_STEPS: usize = 2;
 /// A gripper that is further open than commanded by this much holds something, metres on each side.
-const HOLDS_M: f64 = 0.003;
+const HOLDING_EXCESS_M: f64 = 0.003;
 /// A gripper that is open wider than an object by this much does not hold it, metres on each side.
-const OPEN_M: f64 = 0.002;
+const EMPTY_EXCESS_M: f64 = 0.002;
 /// What a narrow gripper keeps between its pads and an object, metres on each side.
 const CLEARANCE_M: f64 = 0.005;
 /// A hand is about to grasp its object if it ends less than this above the object's centre, metres.
-const GRASP_M: f64 = 0.07;
+const GRASP_HEIGHT_M: f64 = 0.07;
 /// The object is then less than this away, horizontally, metres.
-const OFF_CENTRE_M: f64 = 0.035;
+const GRASP_DISTANCE_M: f64 = 0.035;
 
 impl TrialRunner {
     /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further until
@@ -62,9 +62,9 @@ impl TrialRunner {
     /// it is far from its own.
     fn stays_narrow(&self, arm: usize, state: &mut LoopState, now: &ArmObservation) -> bool {
         let apart_m = (now.object - now.hand).truncate().length();
-        if state.progress.n_held_up(arm) >= N_WIDE && apart_m < OFF_CENTRE_M {
+        if state.progress.n_held_up(arm) >= N_WIDE_STEPS && apart_m < GRASP_DISTANCE_M {
             state.narrow[arm] = true;
-        } else if apart_m > 2.0 * OFF_CENTRE_M {
+        } else if apart_m > 2.0 * GRASP_DISTANCE_M {
             state.narrow[arm] = false;
         }
         state.narrow[arm]
@@ -81,9 +81,9 @@ impl TrialRunner {
     fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         self.is_empty(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
-            && to.z < now.object.z + GRASP_M
-            && ((now.object - to).truncate().length() < OFF_CENTRE_M
-                || (now.object - now.hand).truncate().length() < BETWEEN_M)
+            && to.z < now.object.z + GRASP_HEIGHT_M
+            && ((now.object - to).truncate().length() < GRASP_DISTANCE_M
+                || (now.object - now.hand).truncate().length() < BETWEEN_PADS_DISTANCE_M)
     }
 
     /// Returns whether the object is between the pads of a gripper that is commanded to `commanded_m` and closes to
@@ -92,14 +92,14 @@ impl TrialRunner {
         let to_object = now.object - now.hand;
         opening_m < commanded_m
             && self.is_empty(commanded_m, now)
-            && to_object.truncate().length() < BETWEEN_M
-            && to_object.z.abs() < BESIDE_M
+            && to_object.truncate().length() < BETWEEN_PADS_DISTANCE_M
+            && to_object.z.abs() < BESIDE_HEIGHT_M
     }
 
     /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and holds
     /// nothing.
     fn is_empty(&self, commanded_m: f64, now: &ArmObservation) -> bool {
-        now.opening_m > self.config.trained_half_m + OPEN_M && !holds(commanded_m, now)
+        now.opening_m > self.config.trained_half_m + EMPTY_EXCESS_M && !holds(commanded_m, now)
     }
 
     /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
@@ -109,7 +109,8 @@ impl TrialRunner {
         opening_m > now.opening_m
             && now.opening_m < self.narrow_opening_m(now)
             && to_object.z.abs() < self.config.trained_half_m
-            && (BETWEEN_M..NEAR_M).contains(&to_object.truncate().length())
+            && (BETWEEN_PADS_DISTANCE_M..APPROACH_DISTANCE_M)
+                .contains(&to_object.truncate().length())
             && (to - now.hand).truncate().dot(to_object.truncate()) > 0.0
     }
 
@@ -122,7 +123,7 @@ impl TrialRunner {
         let mut seen = now.to_vec();
         if self.config.layout.task.grasps() && !self.task.shares_object() {
             for (seen, commanded_m) in seen.iter_mut().zip(&state.openings_m) {
-                let is_near = (seen.object - seen.hand).truncate().length() < HELD_M;
+                let is_near = (seen.object - seen.hand).truncate().length() < HELD_DISTANCE_M;
                 if is_near && holds(*commanded_m, seen) {
                     seen.opening_m = seen.opening_m.min(self.config.trained_half_m);
                 }
@@ -134,15 +135,15 @@ impl TrialRunner {
 
 /// Returns whether a gripper commanded to `commanded_m` (metres on each side) holds something.
 fn holds(commanded_m: f64, now: &ArmObservation) -> bool {
-    commanded_m < now.opening_m - HOLDS_M
+    commanded_m < now.opening_m - HOLDING_EXCESS_M
 }
 
 /// Returns whether a hand that moves `to` (arm frame, metres) descends to its object and ends with its pads higher than
-/// [`BESIDE_M`] above the object's centre.
+/// [`BESIDE_HEIGHT_M`] above the object's centre.
 fn descends_to_object(now: &ArmObservation, to: DVec3) -> bool {
     to.z < now.hand.z
-        && to.z > now.object.z + BESIDE_M
-        && (now.object - to).truncate().length() < NEAR_M
+        && to.z > now.object.z + BESIDE_HEIGHT_M
+        && (now.object - to).truncate().length() < APPROACH_DISTANCE_M
 }
 
 #[cfg(test)]

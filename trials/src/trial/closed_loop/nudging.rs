@@ -17,26 +17,26 @@ use crate::trial::runner::TrialRunner;
 /// A hand that has been held up for this many steps in a row pushes its object.
 const N_HELD_UP: usize = 6;
 /// An object at most this far from a hand is below it, horizontally, metres.
-const BELOW_M: f64 = 0.03;
+const BELOW_DISTANCE_M: f64 = 0.03;
 /// Objects whose centres are at most this far apart may lie side by side, in edges of an object.
-const SIDE_BY_SIDE: f64 = 1.6;
+const SIDE_BY_SIDE_EDGES: f64 = 1.6;
 /// The distance by which an object is pushed, metres.
-const PUSH_M: f64 = 0.045;
+const PUSH_DISTANCE_M: f64 = 0.045;
 /// Half the width of closed pads, metres.
-pub(super) const PADS_M: f64 = 0.008;
+pub(super) const PADS_HALF_WIDTH_M: f64 = 0.008;
 /// The gap between the pads of an upright hand and the object before the push, metres. A tilted hand uses most of it up.
-pub(super) const GAP_M: f64 = 0.012;
+pub(super) const PUSH_GAP_M: f64 = 0.012;
 /// Tolerance of what counts as within reach, metres.
-const REACH_M: f64 = 0.004;
+const REACH_TOLERANCE_M: f64 = 0.004;
 /// Height by which a hand rises before it moves beside its object, metres, and the height of its pads above the blocks that
 /// suffices.
 const RISE_M: f64 = 0.06;
-const ABOVE_M: f64 = 0.025;
+const CLEARANCE_ABOVE_M: f64 = 0.025;
 /// Largest distance of one motion, metres, and largest number of motions to one position.
-const LONGEST_M: f64 = 0.1;
+const MAX_PART_M: f64 = 0.1;
 const MAX_PARTS: u32 = 20;
 /// A hand has arrived within this distance, metres.
-const ARRIVED_M: f64 = 0.015;
+const ARRIVAL_TOLERANCE_M: f64 = 0.015;
 
 /// A push along the table: the hand's positions before and after it, arm frame, metres.
 #[derive(Debug, PartialEq)]
@@ -76,7 +76,7 @@ impl ClosedLoop<'_, '_> {
         let runner = self.runner;
         let Push { from, to } = *push;
         let blocks = runner.observed_blocks(objects, None);
-        let above_m = 2.0 * f64::from(runner.config.block.half_m) + ABOVE_M;
+        let above_m = 2.0 * f64::from(runner.config.block.half_m) + CLEARANCE_ABOVE_M;
         let hand = runner.hands(&self.state)[arm];
         let down = hand.with_z(hand.z.min(runner.config.trained_half_m));
         let raised = hand.with_z(above_m.min(hand.z + RISE_M));
@@ -115,7 +115,7 @@ impl ClosedLoop<'_, '_> {
     ) -> Result<bool, FailureCause> {
         let runner = self.runner;
         let from = runner.hands(&self.state)[arm];
-        let n_parts = ((to - from).length() / LONGEST_M).floor() + 1.0;
+        let n_parts = ((to - from).length() / MAX_PART_M).floor() + 1.0;
         for part in (1..=MAX_PARTS).map(f64::from).take_while(|part| *part <= n_parts) {
             let mut hands = runner.hands(&self.state);
             let mut openings_m = self.state.openings_m.clone();
@@ -126,7 +126,7 @@ impl ClosedLoop<'_, '_> {
                 return Ok(false);
             }
         }
-        Ok((runner.hands(&self.state)[arm] - to).length() < ARRIVED_M)
+        Ok((runner.hands(&self.state)[arm] - to).length() < ARRIVAL_TOLERANCE_M)
     }
 }
 
@@ -138,10 +138,10 @@ impl TrialRunner {
         let in_arm = |object: &ObjectPose| self.mapping.object_in_arm(ArmIndex(arm), object.at_m);
         let half_m = f64::from(self.config.block.half_m);
         let object = in_arm(&objects[arm]);
-        let is_below = (object - self.hands(state)[arm]).truncate().length() < BELOW_M;
+        let is_below = (object - self.hands(state)[arm]).truncate().length() < BELOW_DISTANCE_M;
         let is_beside = |other: &usize| {
             let apart_m = (in_arm(&objects[*other]) - object).truncate().length();
-            *other != arm && apart_m < 2.0 * half_m * SIDE_BY_SIDE
+            *other != arm && apart_m < 2.0 * half_m * SIDE_BY_SIDE_EDGES
         };
         let other = (0..objects.len()).find(is_beside).filter(|_| is_below)?;
         let across = self.across(arm, state);
@@ -153,11 +153,12 @@ impl TrialRunner {
             let beside = object - apart;
             let (position, rests) = if pushed == arm { (object, beside) } else { (beside, object) };
             let push = Push {
-                from: position - along * (corner_m + PADS_M + GAP_M),
-                to: position + along * (PUSH_M - half_m - PADS_M),
+                from: position - along * (corner_m + PADS_HALF_WIDTH_M + PUSH_GAP_M),
+                to: position + along * (PUSH_DISTANCE_M - half_m - PADS_HALF_WIDTH_M),
             };
-            let has_room = (rests - push.from).truncate().length() > corner_m + PADS_M;
-            let then = self.mapping.object_in_world(ArmIndex(arm), position + along * PUSH_M);
+            let has_room = (rests - push.from).truncate().length() > corner_m + PADS_HALF_WIDTH_M;
+            let then =
+                self.mapping.object_in_world(ArmIndex(arm), position + along * PUSH_DISTANCE_M);
             let then = self.mapping.object_in_arm(ArmIndex(pushed), then);
             let is_reached = self.is_reached(push.from) && self.is_reached(push.to);
             (has_room && is_reached && self.is_reached(then)).then_some(push)
@@ -174,7 +175,7 @@ impl TrialRunner {
 
     /// Returns whether hands reach the place above or at `position`, arm frame, metres.
     pub(super) fn is_reached(&self, position: DVec3) -> bool {
-        (self.mapping.reachable_hand(position) - position).truncate().length() < REACH_M
+        (self.mapping.reachable_hand(position) - position).truncate().length() < REACH_TOLERANCE_M
     }
 }
 
@@ -205,9 +206,9 @@ mod tests {
         };
         let beside = DVec3::Y * (2.0 * half_m + 0.002);
         let outward = push(object + beside - DVec3::X * 0.01, object).unwrap();
-        assert!(outward.from.x < object.x - half_m - PADS_M, "{outward:?}");
-        let moved_m = outward.to.x + PADS_M + half_m - object.x;
-        assert!((moved_m - PUSH_M).abs() < 1e-6, "{outward:?}");
+        assert!(outward.from.x < object.x - half_m - PADS_HALF_WIDTH_M, "{outward:?}");
+        let moved_m = outward.to.x + PADS_HALF_WIDTH_M + half_m - object.x;
+        assert!((moved_m - PUSH_DISTANCE_M).abs() < 1e-6, "{outward:?}");
         let inward = push(object + beside + DVec3::X * 0.01, object).unwrap();
         assert!(inward.from.x > object.x && inward.to.x < inward.from.x, "{inward:?}");
         assert_eq!(push(object + 2.0 * beside, object), None, "there is room already");

@@ -13,7 +13,7 @@ use crate::trial::outcome::FailureCause;
 /// The horizontal distance from the path of an object below which another object is in its way, metres.
 const CLEARANCE_M: f64 = 0.10;
 /// The distance from the withdrawn position within which a hand can wait, metres. Elsewhere it could block the other arm.
-const WITHDRAWN_WITHIN_M: f64 = 0.05;
+const WITHDRAWAL_TOLERANCE_M: f64 = 0.05;
 
 /// The straight path of an object to its goal, seen from above, world frame, metres.
 #[derive(Debug, Clone, Copy)]
@@ -45,7 +45,7 @@ impl ClosedLoop<'_, '_> {
         let waits: Vec<bool> = (0..paths.len()).map(|arm| arm == waiting).collect();
         self.retreat(&waits)?;
         self.state.before = None;
-        if runner.hands(&self.state)[waiting].distance(place) < WITHDRAWN_WITHIN_M {
+        if runner.hands(&self.state)[waiting].distance(place) < WITHDRAWAL_TOLERANCE_M {
             self.state.parked = waits;
         }
         Ok(())

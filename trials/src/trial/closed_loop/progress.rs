@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 /// An object that is displaced by less rests, metres.
-const REST_M: f64 = 0.015;
+const REST_TOLERANCE_M: f64 = 0.015;
 /// The arms are idle when all misplaced objects have rested for this many steps.
 const MAX_IDLE: usize = 20;
 
@@ -42,8 +42,9 @@ impl Progress {
             *n_held_up = if *is_held_up { *n_held_up + 1 } else { 0 };
         }
         let mut each = objects.iter().zip(misplaced).zip(&self.rested);
-        let rests = each
-            .all(|((object, misplaced), rested)| !misplaced || (object - rested).length() < REST_M);
+        let rests = each.all(|((object, misplaced), rested)| {
+            !misplaced || (object - rested).length() < REST_TOLERANCE_M
+        });
         if rests && self.rested.len() == objects.len() {
             self.n_idle += 1;
         } else {

@@ -8,16 +8,16 @@ use glam::DVec3;
 use tandem_core::ArmIndex;
 
 use super::ClosedLoop;
-use super::nudging::{GAP_M, PADS_M, Push};
-use super::sparing::AHEAD_M;
+use super::nudging::{PADS_HALF_WIDTH_M, PUSH_GAP_M, Push};
+use super::sparing::PUSHING_DISTANCE_M;
 use crate::simulated::ObjectPose;
 use crate::trial::outcome::FailureCause;
 use crate::trial::runner::TrialRunner;
 
 /// Distance from an object that can be grasped to the edge of the hand's box, metres.
-const EDGE_M: f64 = 0.02;
+const EDGE_DISTANCE_M: f64 = 0.02;
 /// Unit of the distance by which an object is pushed, metres, and largest number of units.
-const UNIT_M: f64 = 0.01;
+const PUSH_UNIT_M: f64 = 0.01;
 const MAX_UNITS: u32 = 100;
 
 impl ClosedLoop<'_, '_> {
@@ -51,7 +51,8 @@ impl TrialRunner {
     /// `owner` can get at its object.
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
         let object = self.mapping.object_in_arm(owner, objects[owner.0].at_m);
-        let away_m = if self.config.layout.task.grasps() { EDGE_M } else { AHEAD_M };
+        let away_m =
+            if self.config.layout.task.grasps() { EDGE_DISTANCE_M } else { PUSHING_DISTANCE_M };
         let is_at_hand = |position: DVec3| {
             self.is_reached(position - (goal - position).with_z(0.0).normalize_or_zero() * away_m)
         };
@@ -63,14 +64,14 @@ impl TrialRunner {
         let half_m = f64::from(self.config.block.half_m);
         let corner_m = std::f64::consts::SQRT_2 * half_m;
         let mut recalls = Vec::new();
-        for displacement in displacements.into_iter().filter(|by| by.length() > UNIT_M) {
+        for displacement in displacements.into_iter().filter(|by| by.length() > PUSH_UNIT_M) {
             let along = displacement.normalize();
-            let n_units = (displacement.length() / UNIT_M).floor();
-            let is_back = |n: &f64| is_at_hand(object + along * (*n * UNIT_M));
+            let n_units = (displacement.length() / PUSH_UNIT_M).floor();
+            let is_back = |n: &f64| is_at_hand(object + along * (*n * PUSH_UNIT_M));
             let mut units = (1..MAX_UNITS).map(f64::from).take_while(|n| *n < n_units);
             let n_units = units.find(is_back).map_or(n_units, |n| n + 1.0);
-            let from = object - along * (corner_m + PADS_M + GAP_M);
-            let to = object + along * (n_units * UNIT_M - half_m - PADS_M);
+            let from = object - along * (corner_m + PADS_HALF_WIDTH_M + PUSH_GAP_M);
+            let to = object + along * (n_units * PUSH_UNIT_M - half_m - PADS_HALF_WIDTH_M);
             recalls.extend((0..objects.len()).map(|arm| {
                 let seen = |in_arm| {
                     let position = self.mapping.object_in_world(owner, in_arm);
@@ -115,10 +116,13 @@ mod tests {
         let goal = DVec3::new(0.1, 0.0, 0.03);
         let edge_m = farthest(DVec3::Y).y;
         let object = |room_m: f64| DVec3::new(0.1, edge_m - room_m, 0.03);
-        assert!(recalls(Task::SharedPush, object(AHEAD_M + 0.001), goal).is_empty());
-        assert!(!recalls(Task::SharedPush, object(AHEAD_M - 0.01), goal).is_empty());
+        assert!(recalls(Task::SharedPush, object(PUSHING_DISTANCE_M + 0.001), goal).is_empty());
+        assert!(!recalls(Task::SharedPush, object(PUSHING_DISTANCE_M - 0.01), goal).is_empty());
         let pick = Task::SharedPickAndPlace;
-        assert!(recalls(pick, object(AHEAD_M - 0.01), goal).is_empty(), "it can be grasped");
+        assert!(
+            recalls(pick, object(PUSHING_DISTANCE_M - 0.01), goal).is_empty(),
+            "it can be grasped"
+        );
         assert!(!recalls(pick, object(0.0), goal).is_empty());
     }
 
@@ -131,9 +135,9 @@ mod tests {
         assert_eq!(*arm, 0);
         assert!((from.x - 0.1).abs() < 1e-9 && from.y > object.y + 0.04, "{from}");
         let half_m = 0.0325;
-        let then_m = to.y - half_m - PADS_M;
+        let then_m = to.y - half_m - PADS_HALF_WIDTH_M;
         let room_m = farthest(DVec3::Y).y - then_m;
-        assert!(room_m > AHEAD_M && room_m < AHEAD_M + 0.03, "{then_m}");
+        assert!(room_m > PUSHING_DISTANCE_M && room_m < PUSHING_DISTANCE_M + 0.03, "{then_m}");
         let goal_at_side = DVec3::new(0.1, object.y, 0.03) + DVec3::X * 0.05;
         assert!(recalls(Task::SharedPush, object, goal_at_side).is_empty());
     }

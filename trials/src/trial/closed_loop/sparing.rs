@@ -10,18 +10,18 @@ use crate::trial::mapping::ArmObservation;
 use crate::trial::runner::TrialRunner;
 
 /// An object within this horizontal distance of a hand is between its pads, metres.
-pub(super) const BETWEEN_M: f64 = 0.012;
+pub(super) const BETWEEN_PADS_DISTANCE_M: f64 = 0.012;
 /// The centre of a held object is within this horizontal distance of the hand, metres.
-pub(super) const HELD_M: f64 = 0.02;
+pub(super) const HELD_DISTANCE_M: f64 = 0.02;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
-pub(super) const AHEAD_M: f64 = 0.045;
+pub(super) const PUSHING_DISTANCE_M: f64 = 0.045;
 /// Distance from the inner side of a pad to its middle, metres.
-const PAD_M: f64 = 0.005;
+const PAD_HALF_THICKNESS_M: f64 = 0.005;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
-const BEYOND_M: f64 = 0.001;
+const REACH_EXCESS_M: f64 = 0.001;
 /// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects may end
 /// up side by side at the edge of the table's area.
-const MOVED_M: f64 = 0.02;
+const MAX_PUSH_M: f64 = 0.02;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
@@ -61,7 +61,7 @@ impl TrialRunner {
         let to_object = (now.object - now.hand).truncate();
         let displacement = (to - now.hand).truncate();
         if now.hand.z.min(to.z) >= top_m
-            || to_object.length() < BETWEEN_M
+            || to_object.length() < BETWEEN_PADS_DISTANCE_M
             || displacement.dot(to_object) <= 0.0
         {
             return false;
@@ -71,10 +71,10 @@ impl TrialRunner {
         {
             return false;
         }
-        let ahead = (to_object.normalize() * (AHEAD_M + self.behind_m())).extend(0.0);
+        let ahead = (to_object.normalize() * (PUSHING_DISTANCE_M + self.behind_m())).extend(0.0);
         let beyond =
             |hand: DVec3| beyond_m(hand + ahead, self.mapping.reachable_hand(hand + ahead));
-        beyond(to) > beyond(now.hand) + BEYOND_M
+        beyond(to) > beyond(now.hand) + REACH_EXCESS_M
     }
 
     /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of the
@@ -89,21 +89,21 @@ impl TrialRunner {
     ) -> bool {
         let now = &seen[arms[0]];
         let half_m = self.config.trained_half_m;
-        if (now.object - now.hand).length() < HELD_M {
+        if (now.object - now.hand).length() < HELD_DISTANCE_M {
             let lowest = DVec3::NEG_Z * half_m;
             let path = [now.hand, to].map(|hand| hand + lowest);
             return self.disturbs(arms, seen, path, 2.0 * half_m);
         }
-        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_M);
+        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_HALF_THICKNESS_M);
         let pads = if self.config.layout.task.grasps() { vec![pad, -pad] } else { Vec::new() };
         std::iter::once(DVec3::ZERO)
             .chain(pads)
-            .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], AHEAD_M))
+            .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], PUSHING_DISTANCE_M))
     }
 
     /// Returns whether something of the first arm that moves between two positions, arm frame, metres, with objects
     /// `ahead_m` metres ahead of it, would push the object of the other arm to where that arm's hand cannot follow. A
-    /// gripper that grasps should not push it [at all](MOVED_M) either.
+    /// gripper that grasps should not push it [at all](MAX_PUSH_M) either.
     fn disturbs(
         &self,
         [arm, other]: [usize; 2],
@@ -128,7 +128,7 @@ impl TrialRunner {
             return false;
         }
         let moved = (displacement - displacement.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
-        if self.config.layout.task.grasps() && moved.length() > MOVED_M {
+        if self.config.layout.task.grasps() && moved.length() > MAX_PUSH_M {
             return true;
         }
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
@@ -137,13 +137,13 @@ impl TrialRunner {
         let beyond = |position: DVec3| {
             beyond_m(position + behind, self.mapping.reachable_hand(position + behind))
         };
-        beyond(then) > beyond(others) + BEYOND_M
+        beyond(then) > beyond(others) + REACH_EXCESS_M
     }
 
     /// Distance behind an object at which a hand has to be to bring the object back, metres: a policy that pushes gets
     /// behind it, one that grasps goes to it.
     fn behind_m(&self) -> f64 {
-        if self.config.layout.task.grasps() { 0.0 } else { AHEAD_M }
+        if self.config.layout.task.grasps() { 0.0 } else { PUSHING_DISTANCE_M }
     }
 }
 

@@ -11,9 +11,9 @@ use crate::trial::runner::TrialRunner;
 
 /// The length of the line from hand to hand outside the blocks below which a step is slow, metres. The pads take 1 to
 /// 2 cm of it.
-const ROOM_M: f64 = 0.06;
+const SQUEEZING_ROOM_M: f64 = 0.06;
 /// The speed of a slow step, as a share of the trial's.
-const SLOW: f64 = 0.25;
+const SLOW_SHARE: f64 = 0.25;
 
 impl TrialRunner {
     /// Returns the speed of a step that moves the hands `to` (arm frames, metres), as a share of the trial's. What arms
@@ -28,10 +28,12 @@ impl TrialRunner {
             return 1.0;
         }
         let squeezes = |hands: &[DVec3]| match self.pads_of(hands)[..] {
-            [one, other] => room_m(one, other, wanted.blocks).is_some_and(|room_m| room_m < ROOM_M),
+            [one, other] => {
+                room_m(one, other, wanted.blocks).is_some_and(|room_m| room_m < SQUEEZING_ROOM_M)
+            }
             _ => false,
         };
-        if squeezes(&self.hands(state)) || squeezes(to) { SLOW } else { 1.0 }
+        if squeezes(&self.hands(state)) || squeezes(to) { SLOW_SHARE } else { 1.0 }
     }
 }
 

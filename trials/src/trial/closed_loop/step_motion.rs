@@ -15,13 +15,13 @@ use crate::trial::runner::{TrialRunner, unreachable};
 use crate::trial::shared_object::keep_distance;
 
 /// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
-const STILL_M: f64 = 5e-4;
-const STILL_OPENING: f64 = 0.005;
+const STILL_DISTANCE_M: f64 = 5e-4;
+const STILL_OPENING_CHANGE: f64 = 0.005;
 /// The displacement of an arm that makes room, arm frame, metres.
-const BACK_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
+const RETREAT_OFFSET_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
 
 /// The displacements of an arm that stays or withdraws from the other one, arm frame, metres.
-const APART_M: [DVec3; 5] = [
+const SEPARATING_OFFSETS_M: [DVec3; 5] = [
     DVec3::ZERO,
     DVec3::new(-0.04, 0.0, 0.02),
     DVec3::new(0.0, 0.0, 0.05),
@@ -35,13 +35,13 @@ enum StepPart {
     /// This share of the policy's displacement.
     Share(f64),
     /// Makes room for the other arm.
-    Back,
+    Retreat,
 }
 
 /// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all, so
 /// only the first three remain.
 const ATTEMPTS: [[StepPart; 2]; 10] = {
-    use StepPart::{Back, Share};
+    use StepPart::{Retreat, Share};
     [
         [Share(1.0), Share(1.0)],
         [Share(0.5), Share(0.5)],
@@ -50,9 +50,9 @@ const ATTEMPTS: [[StepPart; 2]; 10] = {
         [Share(0.0), Share(1.0)],
         [Share(0.4), Share(0.0)],
         [Share(0.0), Share(0.4)],
-        [Share(0.6), Back],
-        [Back, Share(0.6)],
-        [Back, Back],
+        [Share(0.6), Retreat],
+        [Retreat, Share(0.6)],
+        [Retreat, Retreat],
     ]
 };
 
@@ -68,13 +68,13 @@ impl ClosedLoop<'_, '_> {
             let mut to: Vec<DVec3> = (0..from.len())
                 .map(|arm| match parts[arm] {
                     StepPart::Share(share) => from[arm].lerp(wanted.hands[arm], share),
-                    StepPart::Back => from[arm] + BACK_M,
+                    StepPart::Retreat => from[arm] + RETREAT_OFFSET_M,
                 })
                 .collect();
             if self.state.carries {
                 runner.keep_hands_apart(&from, &mut to);
             }
-            let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
+            let makes_room = parts.iter().any(|part| matches!(part, StepPart::Retreat));
             let check = if makes_room { &runner.check } else { &runner.step_check };
             if self.attempt(wanted, &to, check)? {
                 let is_whole = attempt == 0 && self.state.withdraw.is_none();
@@ -171,8 +171,8 @@ impl TrialRunner {
         let [first, second] = from else { return Vec::new() };
         let now_m = gap_m(from);
         let mut candidates: Vec<(f64, Vec<DVec3>)> = Vec::new();
-        for one in APART_M {
-            for other in APART_M {
+        for one in SEPARATING_OFFSETS_M {
+            for other in SEPARATING_OFFSETS_M {
                 let to = vec![*first + one, *second + other];
                 let to_m = gap_m(&to);
                 if to_m > now_m {
@@ -263,7 +263,7 @@ impl TrialRunner {
 fn is_joint(parts: &[StepPart]) -> bool {
     let share = |part: &StepPart| match part {
         StepPart::Share(share) => Some(*share),
-        StepPart::Back => None,
+        StepPart::Retreat => None,
     };
     let first = parts.first().and_then(share);
     first.is_some() && parts.iter().all(|part| share(part) == first)
@@ -277,7 +277,7 @@ pub(super) fn tool_axes(placed: &PlacedArm, angles: &Joints) -> DMat3 {
 
 fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
     from.iter().zip(to).all(|(from, to)| {
-        (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_M
-            && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING
+        (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_DISTANCE_M
+            && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING_CHANGE
     })
 }

@@ -11,10 +11,10 @@ use crate::trial::block_avoidance::ObservedBlock;
 use crate::trial::outcome::FailureCause;
 
 /// The force from which a hand withdraws, newtons, and the distance by which it does, metres.
-const PRESSING_N: f64 = 3.0;
-const WITHDRAW_M: f64 = 0.006;
+const PRESSING_FORCE_N: f64 = 3.0;
+const WITHDRAWAL_M: f64 = 0.006;
 /// By how much a gripper that holds something is further open than commanded, metres on each side.
-const GRIPPED_M: f64 = 0.002;
+const GRIP_EXCESS_M: f64 = 0.002;
 
 impl ClosedLoop<'_, '_> {
     /// Continues from where the arms stopped on their way from `first`.
@@ -25,17 +25,17 @@ impl ClosedLoop<'_, '_> {
             state.joint_angles[arm] = angles;
             let opening_m = mapping.policy_opening_m(opening);
             // A gripper that holds something keeps its grip, unless its hand presses on something.
-            let grips = state.openings_m[arm] < opening_m - GRIPPED_M;
-            if !grips || forces_n[arm].length() >= PRESSING_N {
+            let grips = state.openings_m[arm] < opening_m - GRIP_EXCESS_M;
+            if !grips || forces_n[arm].length() >= PRESSING_FORCE_N {
                 state.openings_m[arm] = opening_m;
             }
         }
         let withdraw = forces_n.into_iter().enumerate().map(|(arm, force_n)| {
-            if force_n.length() < PRESSING_N {
+            if force_n.length() < PRESSING_FORCE_N {
                 return DVec3::ZERO;
             }
             let yaw_rad = mapping.cell().arms[arm].yaw_rad;
-            DQuat::from_rotation_z(-yaw_rad) * (force_n.normalize() * WITHDRAW_M)
+            DQuat::from_rotation_z(-yaw_rad) * (force_n.normalize() * WITHDRAWAL_M)
         });
         state.withdraw = Some(withdraw.collect());
         let reached = self.runner.tools(state);
