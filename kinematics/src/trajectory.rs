@@ -69,12 +69,6 @@ impl Trajectory {
         self.times_s[self.times_s.len() - 1]
     }
 
-    /// Returns the number of waypoints.
-    #[must_use]
-    pub fn n_waypoints(&self) -> usize {
-        self.path.n_spans() / self.n_pieces as usize + 1
-    }
-
     /// Returns the time at which the tools are at waypoint `idx` (counted from 0), or closest to it in a corner,
     /// seconds.
     ///

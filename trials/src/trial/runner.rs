@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, TaskSpec};
+use tandem_kinematics::trajectory::DEFAULT_RATE_HZ;
 use tandem_kinematics::{
     ArmWaypoint, CheckSettings, Joints, Motion, PlacedArm, PlanError, PlanSettings, ReachError,
     Waypoint, check, plan,
@@ -22,8 +23,6 @@ use crate::trial::{
 };
 use tandem_bridge::work_cell::{check_settings, mico_cell_of};
 
-/// Samples per second of a motion.
-const RATE_HZ: f64 = 100.0;
 /// Time for objects to come to rest before they are evaluated, seconds.
 pub(super) const REST_S: f64 = 0.5;
 /// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
@@ -217,7 +216,7 @@ impl TrialRunner {
         let planned = plan(cell, waypoints, joint_angles, &PlanSettings::default());
         let trajectory =
             planned.map_err(|error| FailureCause::Refused(MotionRefusal::Plan(error)))?;
-        let motion = trajectory.sampled(RATE_HZ);
+        let motion = trajectory.sampled(DEFAULT_RATE_HZ);
         let first: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
         check(cell, &motion, &first, settings)
             .map_err(|refusal| FailureCause::Refused(MotionRefusal::Check(refusal)))?;
