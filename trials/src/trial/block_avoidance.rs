@@ -8,8 +8,8 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
-/// Half extents of a pad: along the closing direction, across it, along the hand; metres.
-const PAD_HALF_M: DVec3 = DVec3::new(0.005, 0.008, 0.015);
+use crate::simulated::PAD_HALF_M;
+
 /// Distances that are kept beside and above a block, metres.
 const CLEARANCE_BESIDE_M: f64 = 0.003;
 const CLEARANCE_ABOVE_M: f64 = 0.004;
