@@ -1,10 +1,10 @@
 //! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
 //! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
-//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, raised before if its
-//! pads or the block that they hold would graze the other block, and stays just above a block that these would touch. A
-//! hand beside a block moves down first and then sideways, because pads that descend along a block's side press it onto
-//! the table. A hand that holds a block lowers it to the table and no further.
+//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, raised before if
+//! its pads or the block that they hold would graze the other block, and stays just above a block that these would
+//! touch. A hand beside a block moves down first and then sideways, because pads that descend along a block's side
+//! press it onto the table. A hand that holds a block lowers it to the table and no further.
 
 use glam::{DMat3, DVec2, DVec3};
 

@@ -140,8 +140,8 @@ impl<'a, 'rig> ClosedLoop<'a, 'rig> {
         self.move_hands(&wanted)
     }
 
-    /// Returns what the policy wants for `observation` and `goal`, with the changes that spare the objects and keep parked
-    /// arms where they are.
+    /// Returns what the policy wants for `observation` and `goal`, with the changes that spare the objects and keep
+    /// parked arms where they are.
     fn wanted_step<'b>(
         &mut self,
         now: &[ArmObservation],

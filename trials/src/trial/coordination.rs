@@ -10,8 +10,8 @@ use tandem_kinematics::{Joints, Waypoint, WorkCell};
 /// Points between two pairs of waypoints at which the gap is computed.
 const N_BETWEEN: usize = 3;
 
-/// Returns `waypoints` with waiting arms, so that the arms are at least `gap_m` metres apart, or `None` if there are not two
-/// arms, or no such motion. `joint_angles` are near the first waypoint, radians.
+/// Returns `waypoints` with waiting arms, so that the arms are at least `gap_m` metres apart, or `None` if there are
+/// not two arms, or no such motion. `joint_angles` are near the first waypoint, radians.
 pub(crate) fn coordinated(
     cell: &WorkCell,
     waypoints: &[Waypoint],
@@ -56,9 +56,9 @@ fn joint_path(
     angles.collect()
 }
 
-/// Returns the shortest sequence of pairs of positions from the first pair to the last one, on two paths of `n` positions
-/// each. Each pair follows the one before by a step of one arm or of both, from one pair to another, that `is_free`
-/// allows.
+/// Returns the shortest sequence of pairs of positions from the first pair to the last one, on two paths of `n`
+/// positions each. Each pair follows the one before by a step of one arm or of both, from one pair to another, that
+/// `is_free` allows.
 fn shortest(n: usize, is_free: impl Fn([usize; 2], [usize; 2]) -> bool) -> Option<Vec<[usize; 2]>> {
     // Together first, so that arms wait only where they have to.
     const STEPS: [[usize; 2]; 3] = [[1, 1], [1, 0], [0, 1]];

@@ -1,8 +1,8 @@
 //! Copies of the pair, on which motions without feedback are rehearsed and tried.
 //!
-//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. Such
-//! a motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their
-//! noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
+//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. Such a
+//! motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair.
+//! Their noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
 
 use tandem_kinematics::Joints;
 
@@ -18,8 +18,8 @@ use crate::trial::{ActionSource, NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
 pub(super) const FRICTIONS: [f32; 8] = [0.8, 1.2, 0.9, 1.1, 0.85, 1.15, 0.95, 1.05];
-/// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial has
-/// such a number.
+/// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial
+/// has such a number.
 const NOISE_STRIDE: u64 = 1 << 48;
 
 impl TrialRunner {
@@ -61,8 +61,8 @@ impl TrialRunner {
         Ok(report.cause.is_none() && report.objects.iter().all(is_near))
     }
 
-    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction and without
-    /// noise.
+    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction and
+    /// without noise.
     pub(super) fn rehearse_on_copy(
         &self,
         start: &TrialStart,

@@ -27,8 +27,8 @@ pub const PADS_LOWEST_M: f64 = 0.031;
 pub const TABLE_GAP_M: f64 = 0.006;
 /// Half the edge of the training world's blocks unless their sizes vary, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
-/// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above the
-/// table, metres.
+/// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above
+/// the table, metres.
 const WITHDRAWN_POSITION_M: [f64; 2] = [-0.05, 0.20];
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
@@ -106,8 +106,8 @@ impl Mapping {
         self.in_arm(arm, in_world) - DVec3::Z * (self.block_half_m - self.trained_half_m)
     }
 
-    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `in_arm` (arm frame, metres), and
-    /// the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
+    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `in_arm` (arm frame, metres),
+    /// and the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
     /// [`TABLE_GAP_M`] are raised.
     ///
     /// # Errors

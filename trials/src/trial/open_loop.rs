@@ -16,11 +16,11 @@ use crate::trial::{ActionSource, TrialError};
 
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
-/// A rehearsal is tried on the copies of the pair if it fails in at most this many more variants of the training world than
-/// the best one.
+/// A rehearsal is tried on the copies of the pair if it fails in at most this many more variants of the training world
+/// than the best one.
 const VARIANTS_MARGIN: usize = 2;
-/// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of the
-/// training world.
+/// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of
+/// the training world.
 const ENOUGH_VARIANTS: usize = 1;
 /// The number of failed variants of a rehearsal that was not in the training world.
 const UNTRIED: usize = usize::MAX;
@@ -49,8 +49,9 @@ struct Candidate {
 }
 
 impl TrialRunner {
-    /// Plans the most robust of several rehearsals: the one that fails on the fewest copies of the pair. If none of those in
-    /// the training world succeeds on all copies, the policy also plays, with noise, in the closed loop on copies.
+    /// Plans the most robust of several rehearsals: the one that fails on the fewest copies of the pair. If none of
+    /// those in the training world succeeds on all copies, the policy also plays, with noise, in the closed loop on
+    /// copies.
     pub(super) fn rehearse(
         &self,
         start: &TrialStart,
@@ -83,9 +84,9 @@ impl TrialRunner {
         Ok(best.map_or_else(|| self.planned(&rollout, start, joint_angles), |best| best.planned))
     }
 
-    /// Returns the most robust of the configured number of episodes in the training world: the one that fails on the fewest
-    /// copies of the pair and, of those, in the fewest variants of the training world. The actions of all but the first
-    /// episode, `first`, have noise. Returns `None` if the check refuses all motions.
+    /// Returns the most robust of the configured number of episodes in the training world: the one that fails on the
+    /// fewest copies of the pair and, of those, in the fewest variants of the training world. The actions of all but
+    /// the first episode, `first`, have noise. Returns `None` if the check refuses all motions.
     fn rehearse_in_training_world(
         &self,
         start: &TrialStart,
@@ -183,8 +184,8 @@ impl TrialRunner {
         }
     }
 
-    /// Plans and checks the motion through `waypoints` from `joint_angles` (radians). If that brings the arms too close, one
-    /// waits for the other, unless both hold one object. Returns the waypoints of the motion as well.
+    /// Plans and checks the motion through `waypoints` from `joint_angles` (radians). If that brings the arms too
+    /// close, one waits for the other, unless both hold one object. Returns the waypoints of the motion as well.
     pub(super) fn blind_motion(
         &self,
         waypoints: Vec<Waypoint>,
@@ -214,8 +215,8 @@ impl TrialRunner {
         (waypoints, motion)
     }
 
-    /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before it
-    /// starts and, in tasks without grasping, withdraws at the end.
+    /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before
+    /// it starts and, in tasks without grasping, withdraws at the end.
     fn with_withdrawals(&self, waypoints: &[Waypoint], joint_angles: &[Joints]) -> Vec<Waypoint> {
         let (Some(first), Some(last)) = (waypoints.first(), waypoints.last()) else {
             return waypoints.to_vec();
@@ -231,8 +232,8 @@ impl TrialRunner {
         path
     }
 
-    /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far as
-    /// the arms reach.
+    /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far
+    /// as the arms reach.
     fn withdrawal(&self, from: &Waypoint, joint_angles: &[Joints]) -> Vec<Waypoint> {
         let path = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
             let index = ArmIndex(arm);
@@ -264,8 +265,8 @@ impl TrialRunner {
     }
 }
 
-/// Returns the largest number of copies on which a motion may fail that is to be preferred to `best`, or `None` if there
-/// is no such number.
+/// Returns the largest number of copies on which a motion may fail that is to be preferred to `best`, or `None` if
+/// there is no such number.
 fn max_failed_copies(best: Option<&Candidate>, n_failed_variants: usize) -> Option<usize> {
     match best {
         None => Some(usize::MAX),

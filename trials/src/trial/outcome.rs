@@ -8,8 +8,8 @@ use tandem_bridge::executor::{StartError, Stop};
 
 /// An object that rises by more than this was lifted, metres.
 const LIFT_THRESHOLD_M: f64 = 0.03;
-/// An object farther than this from the origin of its arm's frame, along x or y, is out of reach, metres. In the
-/// shared world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
+/// An object farther than this from the origin of its arm's frame, along x or y, is out of reach, metres. In the shared
+/// world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
 const REACH_M: f64 = 0.27;
 
 /// The cause of a failed trial.
@@ -145,8 +145,8 @@ pub(crate) fn contact_failure(touched: Contacts) -> Option<FailureCause> {
     }
 }
 
-/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success. An object has reached
-/// its goal up to a distance of `tolerance_m`.
+/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success. An object has
+/// reached its goal up to a distance of `tolerance_m`.
 pub(crate) fn object_failure(
     task: Task,
     objects: &[ObjectResult],

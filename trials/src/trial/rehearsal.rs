@@ -165,8 +165,8 @@ impl Rehearsal {
         Ok(Rollout { steps, goal_distances_m, contacts })
     }
 
-    /// Prepares variants of the world for the starts that are drawn from now on. An object that all arms share has none:
-    /// they do not predict how an object that two hands hold behaves.
+    /// Prepares variants of the world for the starts that are drawn from now on. An object that all arms share has
+    /// none: they do not predict how an object that two hands hold behaves.
     pub(super) fn add_variants(&mut self) -> Result<(), SimError> {
         if !TaskSpec::from(self.layout).shares_object() {
             let action_m = self.env.description().hand.action_m;

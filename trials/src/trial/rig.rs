@@ -15,8 +15,8 @@ use tandem_bridge::executor::{Executor, Phase, ResetError, Settings, Stop, Token
 const OWNER: Token = Token(1);
 /// Periods until there are enough good states for a reset.
 const N_WARM_UP: usize = 15;
-/// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres. The
-/// envelope stops the arms at 4.
+/// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres.
+/// The envelope stops the arms at 4.
 const YIELD_NM: f64 = 1.5;
 const YIELD_INCREASE_NM: f64 = 0.5;
 /// The longest time from a stop to a reset, periods.
@@ -98,8 +98,8 @@ impl<'a> TrialRig<'a> {
         started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))
     }
 
-    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then hold
-    /// their positions, with their grippers as open as they are. Returns whether the motion came to its end.
+    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then
+    /// hold their positions, with their grippers as open as they are. Returns whether the motion came to its end.
     pub(crate) fn play_yielding(
         &mut self,
         motion: Motion,

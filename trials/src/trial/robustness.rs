@@ -35,7 +35,8 @@ struct Difference {
     pads: f32,
     /// Factor of the objects' masses.
     mass: f32,
-    /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by 180°.
+    /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by
+    /// 180°.
     offset_m: [f32; 2],
 }
 

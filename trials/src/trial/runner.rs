@@ -28,8 +28,8 @@ pub(super) const REST_S: f64 = 0.5;
 /// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
 /// step can start.
 pub(super) const STEP_GAP_M: f64 = 0.025;
-/// Angle between a joint of an arm that starts a trial and the end of the joint's range, radians: a little more than the
-/// executor demands of motions.
+/// Angle between a joint of an arm that starts a trial and the end of the joint's range, radians: a little more than
+/// the executor demands of motions.
 const RANGE_ROOM_RAD: f64 = 0.02;
 /// Friction of the twin, as a share of the pair's.
 const TWIN_FRICTION: f32 = 0.8;

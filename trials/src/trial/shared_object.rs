@@ -39,8 +39,8 @@ pub(crate) fn shared_object(world: &WorldDescription, shown: &[Cuboid]) -> Share
     }
 }
 
-/// Returns `object` with the points of its arms at `points` (world frame, metres), as far as a rigid body that stays level
-/// can have them there.
+/// Returns `object` with the points of its arms at `points` (world frame, metres), as far as a rigid body that stays
+/// level can have them there.
 pub(crate) fn placed(object: SharedObject, points: &[DVec3]) -> SharedObject {
     let ([first, second], [from, to]) = (&object.points_m[..], points) else { return object };
     let in_body = Vec3::from(*second) - Vec3::from(*first);

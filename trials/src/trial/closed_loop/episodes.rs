@@ -1,8 +1,8 @@
 //! Episodes of a trial in the closed loop.
 //!
-//! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
-//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns if their
-//! objects could meet ([`super::order`]) or if they block each other.
+//! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was
+//! trained with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns
+//! if their objects could meet ([`super::order`]) or if they block each other.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
@@ -35,8 +35,8 @@ enum NextAction {
 }
 
 impl ClosedLoop<'_, '_> {
-    /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
-    /// one episode.
+    /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object
+    /// have one episode.
     pub(in crate::trial) fn run(mut self) -> TrialExecution {
         let ended = self.episodes();
         self.state.count_success(self.runner.is_success(self.rig, self.start));
@@ -160,9 +160,9 @@ impl ClosedLoop<'_, '_> {
 
 impl TrialRunner {
     /// Decides which arms make way: those whose objects lie at their goals on the table. If there are none and the arms
-    /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
-    /// the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its turn
-    /// comes when the object of the other one lies at its goal.
+    /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next
+    /// time the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its
+    /// turn comes when the object of the other one lies at its goal.
     fn next_action(
         &self,
         objects: &[ObjectPose],

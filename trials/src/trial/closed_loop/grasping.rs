@@ -1,8 +1,8 @@
 //! Changes to the steps of a policy that grasps, so that a gripper opens and closes where it should.
 //!
-//! The training world's hand opens and closes its gripper while it moves, an arm does so after each step. Pads that close too
-//! early end on the edge of their object, pads that grasp it off its middle or close too late lose it, pads that open too
-//! late push it ahead, and so does a hand that misses it.
+//! The training world's hand opens and closes its gripper while it moves, an arm does so after each step. Pads that
+//! close too early end on the edge of their object, pads that grasp it off its middle or close too late lose it, pads
+//! that open too late push it ahead, and so does a hand that misses it.
 
 use glam::{DVec3, EulerRot};
 
@@ -29,10 +29,10 @@ const GRASP_HEIGHT_M: f64 = 0.07;
 const GRASP_DISTANCE_M: f64 = 0.035;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further until
-    /// its pads are beside the object, and one that another object has held up opens no wider than its own needs. A hand
-    /// that is about to grasp goes to the middle of its object, and stays there until its gripper holds the object. One
-    /// beside its object stays where it is until the object fits between its pads.
+    /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further
+    /// until its pads are beside the object, and one that another object has held up opens no wider than its own needs.
+    /// A hand that is about to grasp goes to the middle of its object, and stays there until its gripper holds the
+    /// object. One beside its object stays where it is until the object fits between its pads.
     pub(super) fn prepare_grasp(
         &self,
         arm: usize,
@@ -58,8 +58,8 @@ impl TrialRunner {
         }
     }
 
-    /// Decides whether the gripper of `arm` is open no wider than its object needs: once another object holds it up, until
-    /// it is far from its own.
+    /// Decides whether the gripper of `arm` is open no wider than its object needs: once another object holds it up,
+    /// until it is far from its own.
     fn stays_narrow(&self, arm: usize, state: &mut LoopState, now: &ArmObservation) -> bool {
         let apart_m = (now.object - now.hand).truncate().length();
         if state.progress.n_held_up(arm) >= N_WIDE_STEPS && apart_m < GRASP_DISTANCE_M {
@@ -76,8 +76,8 @@ impl TrialRunner {
         (sin.abs() + cos.abs()) * self.config.trained_half_m + CLEARANCE_M
     }
 
-    /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it moves
-    /// `to` (arm frame, metres) with an opening of `opening_m`.
+    /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it
+    /// moves `to` (arm frame, metres) with an opening of `opening_m`.
     fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         self.is_empty(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
@@ -96,14 +96,14 @@ impl TrialRunner {
             && to_object.z.abs() < BESIDE_HEIGHT_M
     }
 
-    /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and holds
-    /// nothing.
+    /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and
+    /// holds nothing.
     fn is_empty(&self, commanded_m: f64, now: &ArmObservation) -> bool {
         now.opening_m > self.config.trained_half_m + EMPTY_EXCESS_M && !holds(commanded_m, now)
     }
 
-    /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
-    /// moves `to` (arm frame, metres) the object.
+    /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a
+    /// hand that moves `to` (arm frame, metres) the object.
     fn opens_beside(&self, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         let to_object = now.object - now.hand;
         opening_m > now.opening_m

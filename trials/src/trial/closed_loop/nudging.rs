@@ -1,8 +1,8 @@
 //! Objects that lie side by side.
 //!
-//! A hand cannot grasp an object if another one lies where a pad has to be. In the training world its pads force their way
-//! down; an arm's are [held up](crate::trial::block_avoidance). Such a hand pushes one of the objects along the other one,
-//! with a closed gripper and across its closing direction, so that there is room for its pads.
+//! A hand cannot grasp an object if another one lies where a pad has to be. In the training world its pads force their
+//! way down; an arm's are [held up](crate::trial::block_avoidance). Such a hand pushes one of the objects along the
+//! other one, with a closed gripper and across its closing direction, so that there is room for its pads.
 
 use glam::{DQuat, DVec3};
 use tandem_core::ArmIndex;
@@ -24,12 +24,13 @@ const SIDE_BY_SIDE_EDGES: f64 = 1.6;
 const PUSH_DISTANCE_M: f64 = 0.045;
 /// Half the width of closed pads, metres.
 pub(super) const PADS_HALF_WIDTH_M: f64 = 0.008;
-/// The gap between the pads of an upright hand and the object before the push, metres. A tilted hand uses most of it up.
+/// The gap between the pads of an upright hand and the object before the push, metres. A tilted hand uses most of it
+/// up.
 pub(super) const PUSH_GAP_M: f64 = 0.012;
 /// Tolerance of what counts as within reach, metres.
 const REACH_TOLERANCE_M: f64 = 0.004;
-/// Height by which a hand rises before it moves beside its object, metres, and the height of its pads above the blocks that
-/// suffices.
+/// Height by which a hand rises before it moves beside its object, metres, and the height of its pads above the blocks
+/// that suffices.
 const RISE_M: f64 = 0.06;
 const CLEARANCE_ABOVE_M: f64 = 0.025;
 /// Largest distance of one motion, metres, and largest number of motions to one position.
@@ -46,8 +47,8 @@ pub(super) struct Push {
 }
 
 impl ClosedLoop<'_, '_> {
-    /// If a hand has been held up for [`N_HELD_UP`] steps, pushes its object along the neighbouring one, or the neighbour
-    /// along its object.
+    /// If a hand has been held up for [`N_HELD_UP`] steps, pushes its object along the neighbouring one, or the
+    /// neighbour along its object.
     pub(super) fn nudge(&mut self) -> Result<(), FailureCause> {
         let (runner, state) = (self.runner, &mut self.state);
         if !runner.config.layout.task.grasps() || runner.task.shares_object() {
@@ -65,8 +66,8 @@ impl ClosedLoop<'_, '_> {
         Ok(())
     }
 
-    /// Pushes with the closed gripper of `arm`, which comes from above and rises again. An object that it holds is set down
-    /// first. Returns whether the hand got to both ends of the push.
+    /// Pushes with the closed gripper of `arm`, which comes from above and rises again. An object that it holds is set
+    /// down first. Returns whether the hand got to both ends of the push.
     pub(super) fn carry_out(
         &mut self,
         arm: usize,
@@ -105,8 +106,8 @@ impl ClosedLoop<'_, '_> {
         Ok(arrives)
     }
 
-    /// Moves the hand of `arm` `to` a position (arm frame, metres) with an opening (metres on each side), in parts that the
-    /// check of a motion allows. Returns whether the hand is there, rather than above a block or on its way.
+    /// Moves the hand of `arm` `to` a position (arm frame, metres) with an opening (metres on each side), in parts that
+    /// the check of a motion allows. Returns whether the hand is there, rather than above a block or on its way.
     fn move_hand(
         &mut self,
         arm: usize,
@@ -131,9 +132,9 @@ impl ClosedLoop<'_, '_> {
 }
 
 impl TrialRunner {
-    /// Returns the push that makes room for the pads of `arm`: of its own object, rather away from the other one than past
-    /// it, or else of the other one. There is none if no other object lies beside the arm's own, or if hands cannot reach the
-    /// places.
+    /// Returns the push that makes room for the pads of `arm`: of its own object, rather away from the other one than
+    /// past it, or else of the other one. There is none if no other object lies beside the arm's own, or if hands
+    /// cannot reach the places.
     fn push(&self, arm: usize, objects: &[ObjectPose], state: &LoopState) -> Option<Push> {
         let in_arm = |object: &ObjectPose| self.mapping.object_in_arm(ArmIndex(arm), object.at_m);
         let half_m = f64::from(self.config.block.half_m);

@@ -1,8 +1,8 @@
 //! The order in which two arms push their objects.
 //!
-//! Objects that are pushed at the same time can meet, and one can end where no hand gets behind it. One arm therefore waits
-//! from the start of an episode if an object or a goal lies in the way of the other object. The starts of the shared world
-//! leave both paths free in at least one order.
+//! Objects that are pushed at the same time can meet, and one can end where no hand gets behind it. One arm therefore
+//! waits from the start of an episode if an object or a goal lies in the way of the other object. The starts of the
+//! shared world leave both paths free in at least one order.
 
 use glam::DVec2;
 use tandem_core::ArmIndex;
@@ -12,7 +12,8 @@ use crate::trial::outcome::FailureCause;
 
 /// The horizontal distance from the path of an object below which another object is in its way, metres.
 const CLEARANCE_M: f64 = 0.10;
-/// The distance from the withdrawn position within which a hand can wait, metres. Elsewhere it could block the other arm.
+/// The distance from the withdrawn position within which a hand can wait, metres. Elsewhere it could block the other
+/// arm.
 const WITHDRAWAL_TOLERANCE_M: f64 = 0.05;
 
 /// The straight path of an object to its goal, seen from above, world frame, metres.
@@ -23,8 +24,8 @@ struct ObjectPath {
 }
 
 impl ClosedLoop<'_, '_> {
-    /// Withdraws and parks the arm whose object is to be pushed last, if the order matters. Its turn comes when the other
-    /// object lies at its goal.
+    /// Withdraws and parks the arm whose object is to be pushed last, if the order matters. Its turn comes when the
+    /// other object lies at its goal.
     pub(super) fn order_arms(&mut self) -> Result<(), FailureCause> {
         let (runner, start) = (self.runner, self.start);
         // Hands that grasp lift their objects over others.
@@ -60,7 +61,8 @@ fn waiting_arm(paths: &[ObjectPath]) -> Option<usize> {
 }
 
 impl ObjectPath {
-    /// Returns the smallest distance between the objects, metres, if this one is pushed first and the `second` one after it.
+    /// Returns the smallest distance between the objects, metres, if this one is pushed first and the `second` one
+    /// after it.
     fn room_m(&self, second: &Self) -> f64 {
         self.distance_m(second.from).min(second.distance_m(self.to))
     }

@@ -35,8 +35,8 @@ impl Progress {
         self.held_up.contains(&true)
     }
 
-    /// Counts a step that starts with the objects at `objects`, arm frames, metres. `misplaced` says which of them are away
-    /// from their goals.
+    /// Counts a step that starts with the objects at `objects`, arm frames, metres. `misplaced` says which of them are
+    /// away from their goals.
     pub(super) fn see(&mut self, objects: &[DVec3], misplaced: &[bool]) {
         for (n_held_up, is_held_up) in self.n_held_up.iter_mut().zip(&self.held_up) {
             *n_held_up = if *is_held_up { *n_held_up + 1 } else { 0 };

@@ -1,8 +1,8 @@
 //! Objects that lie where the policy's hand cannot get at them.
 //!
-//! The hand of the training world stays within a box. An object that noise, a neighbour or the other arm has pushed to the
-//! edge of that box cannot be pushed back, because the hand does not get behind it. The arms reach farther: before the next
-//! episode, one of them pushes such an object back.
+//! The hand of the training world stays within a box. An object that noise, a neighbour or the other arm has pushed to
+//! the edge of that box cannot be pushed back, because the hand does not get behind it. The arms reach farther: before
+//! the next episode, one of them pushes such an object back.
 
 use glam::DVec3;
 use tandem_core::ArmIndex;
@@ -21,8 +21,8 @@ const PUSH_UNIT_M: f64 = 0.01;
 const MAX_UNITS: u32 = 100;
 
 impl ClosedLoop<'_, '_> {
-    /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to get at
-    /// them.
+    /// Pushes the objects that lie out of the reach of their arms toward their goals, as far as it takes for a hand to
+    /// get at them.
     pub(super) fn recall(&mut self) -> Result<(), FailureCause> {
         let (runner, start) = (self.runner, self.start);
         for owner in runner.config.layout.arms() {
@@ -46,9 +46,9 @@ impl ClosedLoop<'_, '_> {
 }
 
 impl TrialRunner {
-    /// Returns the pushes that may bring the object of `owner` back, each with the arm that makes it and in its frame, best
-    /// first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the hand of
-    /// `owner` can get at its object.
+    /// Returns the pushes that may bring the object of `owner` back, each with the arm that makes it and in its frame,
+    /// best first: straight toward the goal or along an axis, and within the hand's box or not. There are none if the
+    /// hand of `owner` can get at its object.
     fn recalls(&self, owner: ArmIndex, objects: &[ObjectPose], goal: DVec3) -> Vec<(usize, Push)> {
         let object = self.mapping.object_in_arm(owner, objects[owner.0].at_m);
         let away_m =

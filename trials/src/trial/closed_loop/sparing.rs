@@ -19,16 +19,16 @@ pub(super) const PUSHING_DISTANCE_M: f64 = 0.045;
 const PAD_HALF_THICKNESS_M: f64 = 0.005;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
 const REACH_EXCESS_M: f64 = 0.001;
-/// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects may end
-/// up side by side at the edge of the table's area.
+/// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects
+/// may end up side by side at the edge of the table's area.
 const MAX_PUSH_M: f64 = 0.02;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm, or that grasp and
-    /// would push the other arm's object: they rise. Grippers that grasp also [open and close when and where they
-    /// should](Self::prepare_grasp).
+    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm, or that
+    /// grasp and would push the other arm's object: they rise. Grippers that grasp also [open and close when and where
+    /// they should](Self::prepare_grasp).
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
@@ -77,9 +77,9 @@ impl TrialRunner {
         beyond(to) > beyond(now.hand) + REACH_EXCESS_M
     }
 
-    /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of the
-    /// other arm where it [should not](Self::disturbs) if it moves `to`, frame of the first arm, metres. `across` is the
-    /// direction across the closing direction of its gripper.
+    /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of
+    /// the other arm where it [should not](Self::disturbs) if it moves `to`, frame of the first arm, metres. `across`
+    /// is the direction across the closing direction of its gripper.
     fn pushes_from_its_arm(
         &self,
         arms: [usize; 2],

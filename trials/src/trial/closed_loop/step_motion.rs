@@ -38,8 +38,8 @@ enum StepPart {
     Retreat,
 }
 
-/// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all, so
-/// only the first three remain.
+/// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all,
+/// so only the first three remain.
 const ATTEMPTS: [[StepPart; 2]; 10] = {
     use StepPart::{Retreat, Share};
     [
@@ -91,7 +91,8 @@ impl ClosedLoop<'_, '_> {
         Ok(false)
     }
 
-    /// Moves the hands `to` (arm frames, metres) if `check` allows it. Returns whether it does, also if the hands are there.
+    /// Moves the hands `to` (arm frames, metres) if `check` allows it. Returns whether it does, also if the hands are
+    /// there.
     pub(super) fn attempt(
         &mut self,
         wanted: &WantedStep<'_>,
@@ -157,8 +158,8 @@ impl TrialRunner {
         arms.map(|(arm, angles)| self.mapping.hand_in_arm(ArmIndex(arm), angles)).collect()
     }
 
-    /// Returns the positions of the hands (arm frames, metres) in which two arms are farther apart than `from`, farthest
-    /// first.
+    /// Returns the positions of the hands (arm frames, metres) in which two arms are farther apart than `from`,
+    /// farthest first.
     fn positions_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
         let gap_m = |hands: &[DVec3]| {
             let reached =
@@ -199,9 +200,10 @@ impl TrialRunner {
         }
     }
 
-    /// Returns the waypoints of the tools for end effectors that move `to` (arm frames, metres): two corners, the end, and
-    /// the end again with closed grippers. A gripper that closed while it moves would drag its object along. `measured`
-    /// are the openings of the grippers, 0 to 1. Also returns whether a block keeps each hand from where it is to be.
+    /// Returns the waypoints of the tools for end effectors that move `to` (arm frames, metres): two corners, the end,
+    /// and the end again with closed grippers. A gripper that closed while it moves would drag its object along.
+    /// `measured` are the openings of the grippers, 0 to 1. Also returns whether a block keeps each hand from where it
+    /// is to be.
     fn step_waypoints(
         &self,
         to: &[DVec3],
@@ -269,7 +271,8 @@ fn is_joint(parts: &[StepPart]) -> bool {
     first.is_some() && parts.iter().all(|part| share(part) == first)
 }
 
-/// Returns the axes of an arm's tool as columns, world frame: its fingers close along the first and point along the third.
+/// Returns the axes of an arm's tool as columns, world frame: its fingers close along the first and point along the
+/// third.
 pub(super) fn tool_axes(placed: &PlacedArm, angles: &Joints) -> DMat3 {
     let tool = placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool();
     DMat3::from_quat(tool.rotation.into())
