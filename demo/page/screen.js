@@ -2,6 +2,8 @@
 
 /** Colours of the arms' joints, objects and goals; red, green and blue. They are those of films and reports. */
 const ARMS = [[47, 120, 189], [224, 128, 51]];
+/** Colour of the parts of a shared object that belong to no arm, as in films. */
+const PART = [150, 156, 163];
 const TABLE = [233, 228, 219];
 const LINK = [238, 240, 243];
 const HAND = [74, 82, 92];
@@ -102,7 +104,7 @@ export class Screen {
   }
 
   face({ of, arm, points, shade }) {
-    const color = { object: ARMS[arm], hand: HAND, pedestal: PEDESTAL }[of];
+    const color = { object: ARMS[arm] ?? PART, hand: HAND, pedestal: PEDESTAL }[of];
     this.polygon(points, css(lit(color, shade)));
     // Covers the gap between neighbouring faces.
     this.context.strokeStyle = css(lit(color, 0.94 * shade));

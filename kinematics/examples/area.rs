@@ -37,8 +37,8 @@ fn print_row(frame: TaskFrame, heights_m: [f32; 2]) {
     for _ in 0..N_POINTS {
         let mut between = |low, high| f64::from(uniform(&mut rng, low, high));
         let (x, y) = (between(-AREA_M, AREA_M), between(-AREA_M, AREA_M));
-        let own = Point3::new(x, y, between(heights_m[0], heights_m[1]));
-        let position_m = frame.base_from_own(&own);
+        let in_arm = Point3::new(x, y, between(heights_m[0], heights_m[1]));
+        let position_m = frame.base_from_arm(&in_arm);
         let target = ToolTarget { position_m, yaw_rad: WorkCell::FINGERS_YAW_RAD };
         if let Ok(solution) = MICO_4.inverse_kinematics(&target, &seed) {
             reached += 1;

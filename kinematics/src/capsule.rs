@@ -92,8 +92,8 @@ impl LinkCapsules {
         least_m: f64,
     ) -> f64 {
         let [first, second] = pair.links.map(|link| {
-            let shut_share = model.links[link].shut_share;
-            self.capsules[link].shortened(shut_share + gripper_opening * (1.0 - shut_share))
+            let closed_share = model.links[link].closed_share;
+            self.capsules[link].shortened(closed_share + gripper_opening * (1.0 - closed_share))
         });
         first.gap_m(&second, least_m - pair.allowance_m) + pair.allowance_m
     }

@@ -20,14 +20,14 @@
 //!
 //! // Inverse kinematics: the solution for a point of the world nearest to the present angles.
 //! let arm = &cell.arms[0];
-//! let target_m = cell.world_from_own(ArmIndex(0), &Point3::new(0.0, 0.1, 0.15));
+//! let target_m = cell.world_from_arm(ArmIndex(0), &Point3::new(0.0, 0.1, 0.15));
 //! let solution = arm.model.inverse_kinematics(&arm.target(&target_m), &start[0])?;
 //! assert!(solution.tilt_rad < 0.4);
 //!
 //! // A plan: both tools rise by 5 cm while the grippers close.
 //! let at = |z_m: f64, gripper_opening: f64| {
 //!     [0, 1].map(|arm| ArmWaypoint {
-//!         tool_in_world_m: cell.world_from_own(ArmIndex(arm), &Point3::new(0.0, 0.0, z_m)),
+//!         tool_in_world_m: cell.world_from_arm(ArmIndex(arm), &Point3::new(0.0, 0.0, z_m)),
 //!         gripper_opening,
 //!     })
 //! };

@@ -14,7 +14,7 @@ pub struct Limits {
     /// joint alone accelerates the tool of an outstretched Mico by at most 0.15 g, so that inertia adds little to the
     /// static load of the motors, and a stop from full speed takes 5 degrees.
     pub ramp_s: f64,
-    /// Largest change of a gripper's opening per second, where 0 is shut and 1 open. The default of 0.8 is a choice:
+    /// Largest change of a gripper's opening per second, where 0 is closed and 1 open. The default of 0.8 is a choice:
     /// the arm's description gives no speed of the fingers.
     pub gripper_opening_per_s: f64,
 }

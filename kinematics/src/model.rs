@@ -41,8 +41,8 @@ pub struct Link {
     pub ends: [Anchor; 2],
     /// Radius, metres.
     pub radius_m: f64,
-    /// Share of the segment, about its middle, that remains when the gripper is shut; 1 for parts of fixed length.
-    pub shut_share: f64,
+    /// Share of the segment, about its middle, that remains when the gripper is closed; 1 for parts of fixed length.
+    pub closed_share: f64,
 }
 
 /// Two parts of one arm that can collide.

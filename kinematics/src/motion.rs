@@ -9,7 +9,7 @@ pub struct ArmSample {
     pub angles: Joints,
     /// Joint velocities, radians per second.
     pub velocities: Joints,
-    /// Opening of the gripper: 0 is shut, 1 open.
+    /// Opening of the gripper: 0 is closed, 1 open.
     pub gripper_opening: f64,
 }
 
@@ -209,8 +209,8 @@ mod tests {
         let (first_s, then_s) = (share * period_s, (1.0 - share) * period_s);
         let middle = 0.2 + limit * first_s;
         let last = middle - limit * then_s;
-        let way = 0.5 * (0.2 + middle) * first_s + 0.5 * (middle + last) * then_s;
-        let least = cubic([0.0, way], [0.2, last], period_s).least_acceleration();
+        let displacement = 0.5 * (0.2 + middle) * first_s + 0.5 * (middle + last) * then_s;
+        let least = cubic([0.0, displacement], [0.2, last], period_s).least_acceleration();
         assert!((least - limit).abs() < 1e-9, "{least}");
         let even = cubic([0.0, 0.2 * 0.01 + 1e-4], [0.2, 0.22], period_s).least_acceleration();
         assert!((even - 2.0).abs() < 1e-9, "{even}");

@@ -45,7 +45,7 @@ pub const MAX_WAYPOINTS: usize = 1000;
 pub struct ArmWaypoint {
     /// Position of the tool's origin in the world, metres.
     pub tool_in_world_m: Point3<f64>,
-    /// Opening of the gripper: 0 is shut, 1 open.
+    /// Opening of the gripper: 0 is closed, 1 open.
     pub gripper_opening: f64,
 }
 

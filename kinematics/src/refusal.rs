@@ -79,7 +79,7 @@ pub enum Reason {
     #[error("joint {} accelerates by {:.1} degrees/s2, at most {:.1}",
         .0 + 1, .1.got.to_degrees(), .1.allowed.to_degrees())]
     JointAcceleration(usize, Excess),
-    /// The gripper opening is not between 0 (shut) and 1 (open).
+    /// The gripper opening is not between 0 (closed) and 1 (open).
     #[error("the gripper opening is {0}, expected 0 to 1")]
     GripperOpening(f64),
     /// The gripper opening changes too fast; 1/s.

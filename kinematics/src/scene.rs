@@ -17,7 +17,7 @@ const SHELL_BEHIND_M: f64 = 0.110;
 const FINGER_HALF_M: Vector3<f64> = Vector3::new(0.005, 0.008, 0.015);
 const FINGER_AHEAD_M: f64 = 0.021;
 /// Distance of an open finger from the middle, metres.
-const OPEN_M: f64 = 0.062;
+const OPEN_DISTANCE_M: f64 = 0.062;
 
 impl WorkCell {
     /// Returns the arms at joint angles `angles` (radians, arm by arm) with grippers open by `openings` (0 to 1, arm by
@@ -55,7 +55,7 @@ impl PlacedArm {
         let forward = ForwardKinematics::new(self.model, angles);
         let world_from_base = self.world_from_base();
         let point = |anchor: &Anchor| single(&(world_from_base * forward.anchor_m(anchor)));
-        let links = self.model.links.iter().filter(|link| is_rigid(link.shut_share));
+        let links = self.model.links.iter().filter(|link| is_rigid(link.closed_share));
         let n_joints = angles.len();
         ArmScene {
             base: single(&self.base_in_world_m),
@@ -79,13 +79,13 @@ impl PlacedArm {
 }
 
 /// Returns whether a part has the same shape at every opening. The gripper is drawn as fingers instead.
-fn is_rigid(shut_share: f64) -> bool {
-    shut_share >= 1.0
+fn is_rigid(closed_share: f64) -> bool {
+    closed_share >= 1.0
 }
 
 /// Returns the shell of the hand and its two fingers, which move along the tool's x axis.
 fn hand(world_from_tool: &Isometry3<f64>, opening: f64) -> Vec<Cuboid> {
-    let aside_m = opening.clamp(0.0, 1.0) * OPEN_M + FINGER_HALF_M.x;
+    let aside_m = opening.clamp(0.0, 1.0) * OPEN_DISTANCE_M + FINGER_HALF_M.x;
     let parts = [
         (Point3::new(0.0, 0.0, -SHELL_BEHIND_M), SHELL_HALF_M),
         (Point3::new(-aside_m, 0.0, FINGER_AHEAD_M), FINGER_HALF_M),
@@ -126,7 +126,7 @@ mod tests {
             let apart_m = left.centre.iter().zip(right.centre).map(|(a, b)| (a - b).powi(2));
             let expected_m = 2.0 * (opening * 0.062 + 0.005);
             assert!((apart_m.sum::<f32>().sqrt() - expected_m).abs() < 1e-5, "{arm:?}");
-            // The fingers close along the own frame's y.
+            // The fingers close along the arm frame's y.
             assert!((left.centre[0] - right.centre[0]).abs() < 1e-3, "{arm:?}");
         }
         assert!(scene.arms[0].base[0] < scene.arms[1].base[0]);

@@ -1,12 +1,12 @@
 //! The relation between the training world's frames and the arms' base frames.
 //!
-//! **The classic training world** gives every number in an arm's own frame: origin on the table in the centre of the
+//! **The classic training world** gives every number in an arm frame: origin on the table in the centre of the
 //! arm's workspace, x away from its base, z up, metres. The second arm's frame is the first's rotated by half a turn.
 //! Objects and goals lie within 0.12 m of the centre along x and y and up to 0.27 m high (two arms); the tool moves
 //! within 0.20 m, 0.25 m and 0.35 m. The gripper's fingers close along y.
 //!
 //! **The Mico with four joints** points nearly down in a narrow ring only (see [`inverse`](crate::inverse)), and the
-//! training world's base, 0.40 m behind the centre, is outside that ring. A [`TaskFrame`] scales own frames about their
+//! training world's base, 0.40 m behind the centre, is outside that ring. A [`TaskFrame`] scales arm frames about their
 //! centre and moves the centre into the ring. The table gives the share of points, drawn uniformly from the tasks'
 //! area, at which the gripper tilts by at most 15, 20, 25, 30 and 40 degrees (measured by example `area`):
 //!
@@ -26,14 +26,14 @@
 
 use nalgebra::{Point3, Vector3};
 
-/// The pose and scale of an arm's own frame of the training world in the arm's base frame.
+/// The pose and scale of an arm frame of the training world in the arm's base frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TaskFrame {
     /// Metres on the table per metre of the training world.
     pub scale: f64,
-    /// Distance of the own frame's origin from the base, along the base's x axis, metres.
+    /// Distance of the arm frame's origin from the base, along the base's x axis, metres.
     pub centre_m: f64,
-    /// Height of the own frame's origin above the base, metres.
+    /// Height of the arm frame's origin above the base, metres.
     pub lift_m: f64,
 }
 
@@ -41,15 +41,15 @@ impl TaskFrame {
     /// The frame for the Mico with four joints.
     pub const MICO_4: Self = Self { scale: 0.5, centre_m: 0.27, lift_m: 0.045 };
 
-    /// Maps a point of the own frame (metres of the training world) to the arm's base frame (metres).
+    /// Maps a point of the arm frame (metres of the training world) to the arm's base frame (metres).
     #[must_use]
-    pub fn base_from_own(&self, point_in_own: &Point3<f64>) -> Point3<f64> {
-        point_in_own * self.scale + self.origin_in_base()
+    pub fn base_from_arm(&self, point_in_arm: &Point3<f64>) -> Point3<f64> {
+        point_in_arm * self.scale + self.origin_in_base()
     }
 
-    /// Maps a point of the arm's base frame (metres) to the own frame (metres of the training world).
+    /// Maps a point of the arm's base frame (metres) to the arm frame (metres of the training world).
     #[must_use]
-    pub fn own_from_base(&self, point_in_base: &Point3<f64>) -> Point3<f64> {
+    pub fn arm_from_base(&self, point_in_base: &Point3<f64>) -> Point3<f64> {
         (point_in_base - self.origin_in_base()) / self.scale
     }
 

@@ -38,7 +38,7 @@ pub struct ArmState {
     pub velocities: Joints,
     /// Joint accelerations, radians per second squared.
     pub accelerations: Joints,
-    /// Opening of the gripper: 0 is shut, 1 open.
+    /// Opening of the gripper: 0 is closed, 1 open.
     pub gripper_opening: f64,
     /// Rate of change of the opening, 1/s.
     pub gripper_opening_per_s: f64,
@@ -67,12 +67,6 @@ impl Trajectory {
     #[must_use]
     pub fn duration_s(&self) -> f64 {
         self.times_s[self.times_s.len() - 1]
-    }
-
-    /// Returns the number of waypoints.
-    #[must_use]
-    pub fn n_waypoints(&self) -> usize {
-        self.path.n_spans() / self.n_pieces as usize + 1
     }
 
     /// Returns the time at which the tools are at waypoint `idx` (counted from 0), or closest to it in a corner,

@@ -50,7 +50,7 @@ pub struct Gaps {
 }
 
 impl WorkCell {
-    /// The direction in which the fingers close, base frame, radians: along the own frame's y.
+    /// The direction in which the fingers close, base frame, radians: along the arm frame's y.
     pub const FINGERS_YAW_RAD: f64 = FRAC_PI_2;
 
     /// Returns two Micos with four joints that face each other, the centres of their workspaces 0.24 m apart.
@@ -59,7 +59,7 @@ impl WorkCell {
         Self::mico_pair_with(TaskFrame::MICO_4)
     }
 
-    /// As [`mico_pair`](Self::mico_pair), with the own frames at `task_frame` in the bases.
+    /// As [`mico_pair`](Self::mico_pair), with the arm frames at `task_frame` in the bases.
     #[must_use]
     pub fn mico_pair_with(task_frame: TaskFrame) -> Self {
         let centres_apart_m = f64::from(WORKSPACE_DISTANCE_M);
@@ -72,24 +72,24 @@ impl WorkCell {
         Self { arms: vec![arm(-x_m, 0.0), arm(x_m, PI)], table_z_m: 0.0, task_frame }
     }
 
-    /// Maps a point of the own frame of `arm` (metres of the training world) to the world (metres).
+    /// Maps a point of the frame of `arm` (metres of the training world) to the world (metres).
     ///
     /// # Panics
     /// If there is no such arm.
     #[must_use]
-    pub fn world_from_own(&self, arm: ArmIndex, point_in_own: &Point3<f64>) -> Point3<f64> {
-        self.arms[arm.0].world_from_base() * self.task_frame.base_from_own(point_in_own)
+    pub fn world_from_arm(&self, arm: ArmIndex, point_in_arm: &Point3<f64>) -> Point3<f64> {
+        self.arms[arm.0].world_from_base() * self.task_frame.base_from_arm(point_in_arm)
     }
 
     /// Returns joint angles, arm by arm, that hold each tool above the centre of its workspace with the elbow up.
-    /// `height_in_own_m` is the height in the own frame, metres.
+    /// `height_in_arm_m` is the height in the arm frame, metres.
     ///
     /// # Errors
     /// Returns the reason why an arm cannot reach that position.
-    pub fn ready(&self, height_in_own_m: f64) -> Result<Vec<Joints>, ReachError> {
-        let position_in_own = Point3::new(0.0, 0.0, height_in_own_m);
+    pub fn ready(&self, height_in_arm_m: f64) -> Result<Vec<Joints>, ReachError> {
+        let position_in_arm = Point3::new(0.0, 0.0, height_in_arm_m);
         let ready = |(arm, placed): (ArmIndex, &PlacedArm)| {
-            let target = placed.target(&self.world_from_own(arm, &position_in_own));
+            let target = placed.target(&self.world_from_arm(arm, &position_in_arm));
             let seed = Joints::new(placed.model.elbow_up_rad);
             Ok(placed.model.inverse_kinematics(&target, &seed)?.angles)
         };
@@ -145,7 +145,7 @@ impl PlacedArm {
         Isometry3::from_parts(Translation3::from(self.base_in_world_m), rotation)
     }
 
-    /// Returns the target that brings the tool to `tool_in_world_m` (metres) with the fingers along the own frame's y.
+    /// Returns the target that brings the tool to `tool_in_world_m` (metres) with the fingers along the arm frame's y.
     #[must_use]
     pub fn target(&self, tool_in_world_m: &Point3<f64>) -> ToolTarget {
         let position_m = self.world_from_base().inverse_transform_point(tool_in_world_m);
@@ -165,14 +165,14 @@ mod tests {
     #[test]
     fn the_arms_face_each_other() {
         let cell = WorkCell::mico_pair();
-        let check = |arm, own: [f64; 3], world: [f64; 3]| {
-            let own = Point3::from(own);
-            let got = cell.world_from_own(ArmIndex(arm), &own);
+        let check = |arm, in_arm: [f64; 3], world: [f64; 3]| {
+            let in_arm = Point3::from(in_arm);
+            let got = cell.world_from_arm(ArmIndex(arm), &in_arm);
             // The training world's distances are single precision.
             assert!((got - Point3::from(world)).norm() < 1e-8, "{got}");
             let in_base = cell.arms[arm].world_from_base().inverse_transform_point(&got);
-            let back = cell.task_frame.own_from_base(&in_base);
-            assert!((back - own).norm() < 1e-12, "{back}");
+            let back = cell.task_frame.arm_from_base(&in_base);
+            assert!((back - in_arm).norm() < 1e-12, "{back}");
         };
         check(0, [0.0, 0.0, 0.0], [-0.12, 0.0, 0.045]);
         check(1, [0.0, 0.0, 0.0], [0.12, 0.0, 0.045]);

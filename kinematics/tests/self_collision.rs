@@ -57,7 +57,7 @@ static MICO_6: LazyLock<ArmModel> = LazyLock::new(|| {
         }
     };
     let joints = MICO_6_TABLE.iter().enumerate().map(|(idx, row)| joint(idx, row));
-    let link = |name, ends, radius_m| Link { name, ends, radius_m, shut_share: 1.0 };
+    let link = |name, ends, radius_m| Link { name, ends, radius_m, closed_share: 1.0 };
     let between = |from, to| [Anchor::origin_of(from), Anchor::origin_of(to)];
     let at = |x, z| Anchor { frame: 7, offset_m: Point3::new(x, 0.0, z) };
     let hand_end = Anchor { frame: 6, offset_m: Point3::new(0.0, 0.0, -0.10) };
@@ -69,7 +69,7 @@ static MICO_6: LazyLock<ArmModel> = LazyLock::new(|| {
         link("wrist", between(5, 6), 0.040),
         link("hand", [Anchor::origin_of(6), hand_end], 0.045),
         Link {
-            shut_share: 1.0 / 3.0,
+            closed_share: 1.0 / 3.0,
             ..link("gripper", [at(-0.0525, 0.0085), at(0.0525, 0.0085)], 0.035)
         },
     ];
@@ -315,9 +315,9 @@ fn a_narrower_gripper_has_more_room() {
     let mut n_let = 0;
     for _ in 0..20_000 {
         let angles = random_angles(&MICO_4, &mut rng);
-        let [shut, half, open] = [0.0, 0.5, 1.0].map(|o| MICO_4.self_gap_m(&angles, o));
-        assert!(shut >= half - 1e-12 && half >= open - 1e-12, "{angles:?}");
-        n_let += u32::from(shut >= MARGIN_M && open < MARGIN_M);
+        let [closed, half, open] = [0.0, 0.5, 1.0].map(|o| MICO_4.self_gap_m(&angles, o));
+        assert!(closed >= half - 1e-12 && half >= open - 1e-12, "{angles:?}");
+        n_let += u32::from(closed >= MARGIN_M && open < MARGIN_M);
     }
     assert!(n_let > 20, "{n_let}");
 }

@@ -160,7 +160,7 @@ struct HandCapsules {
 fn hand_capsules(settings: &HandSettings) -> HandCapsules {
     let [.., shell, fingers] = MICO_4.links else { unreachable!("a Mico has a hand") };
     let share = match settings.gripper {
-        Gripper::Locked => fingers.shut_share,
+        Gripper::Locked => fingers.closed_share,
         Gripper::Driven => 1.0,
     };
     let to_pads_m = MICO_4.plane_lengths_m().hand_m + PADS_AHEAD_M;

@@ -30,6 +30,7 @@ pub use config::{
 };
 pub use drill::Drill;
 pub use physics::MAX_OPENING_M;
+pub(crate) use physics::PAD_HALF_M;
 pub use realtime::RealTimePair;
 pub use sensors::ObjectPose;
 
@@ -88,7 +89,7 @@ impl SimulatedPair {
         );
         assert!(at.iter().all(|angles| angles.len() == 4), "arms with four joints");
         let rng = |source| episode_rng(config.seed, source as u64, Stream::Reset);
-        let poses: Vec<ArmPoses> = arm_poses(&cell, at).collect();
+        let poses: Vec<ArmPoses> = arm_poses(&cell, at.iter()).collect();
         let opening = opening.clamp(0.0, 1.0);
         let world = PhysicsWorld::new(&config, &poses, single(opening), single(cell.table_z_m));
         let objects = objects(&world, 0.0);
@@ -202,14 +203,20 @@ impl SimulatedPair {
         self.self_contacts.fill(false);
         let n_arms = self.cell.arms.len();
         let mut forces_n = vec![DVec3::ZERO; n_arms];
+        let (mut openings, mut commanded) = (vec![0.0; n_arms], vec![0.0; n_arms]);
+        let mut poses = Vec::with_capacity(n_arms);
         for _ in 0..N_SUBSTEPS {
-            let torques = self.torques_nm.clone();
-            let opened: Vec<f64> = (0..n_arms).map(|arm| self.world.opening(arm)).collect();
-            self.drives.step(&self.cell, &self.config, &self.disturbance, &opened, &torques);
-            let angles: Vec<Joints> = self.drives.arms.iter().map(|arm| arm.angles).collect();
-            let poses: Vec<ArmPoses> = arm_poses(&self.cell, &angles).collect();
-            let openings: Vec<f64> = self.drives.arms.iter().map(|arm| arm.opening).collect();
-            self.world.step(&poses, &openings, &self.config.gripper);
+            for (arm, opening) in openings.iter_mut().enumerate() {
+                *opening = self.world.opening(arm);
+            }
+            let (cell, torques) = (&self.cell, &self.torques_nm);
+            self.drives.step(cell, &self.config, &self.disturbance, &openings, torques);
+            poses.clear();
+            poses.extend(arm_poses(cell, self.drives.arms.iter().map(|arm| &arm.angles)));
+            for (opening, arm) in commanded.iter_mut().zip(&self.drives.arms) {
+                *opening = arm.opening;
+            }
+            self.world.step(&poses, &commanded, &self.config.gripper);
             for (arm, force_n) in forces_n.iter_mut().enumerate() {
                 *force_n += self.world.force_n(arm) / f64::from(N_SUBSTEPS);
             }
@@ -302,7 +309,10 @@ pub(crate) fn single(number: f64) -> f32 {
 }
 
 /// Returns the poses of the arms' bodies for joint angles `angles`, radians.
-fn arm_poses(cell: &WorkCell, angles: &[Joints]) -> impl Iterator<Item = ArmPoses> {
+fn arm_poses<'a>(
+    cell: &'a WorkCell,
+    angles: impl Iterator<Item = &'a Joints>,
+) -> impl Iterator<Item = ArmPoses> {
     cell.arms.iter().zip(angles).map(|(placed, angles)| {
         let posture = ForwardKinematics::new(placed.model, angles);
         let world_from_base = placed.world_from_base();
@@ -321,7 +331,7 @@ fn objects(world: &PhysicsWorld, time_s: f64) -> Vec<ObjectPose> {
     let pose = |idx| {
         let pose = world.object(idx);
         let at_m = pose.translation.as_dvec3();
-        ObjectPose { at_m, turn: pose.rotation.as_dquat(), time_s }
+        ObjectPose { at_m, orientation: pose.rotation.as_dquat(), time_s }
     };
     (0..world.n_objects()).map(pose).collect()
 }

@@ -114,7 +114,7 @@ pub struct TrialReport {
     pub number: u64,
     /// The cause of a failure; `None` is success.
     pub cause: Option<FailureCause>,
-    /// The results of the objects in the arms' own frames, arm by arm.
+    /// The results of the objects in the arm frames, arm by arm.
     pub objects: Vec<ObjectResult>,
     /// The positions of the objects in the world frame, arm by arm.
     pub positions: Vec<ObjectPositions>,

@@ -71,8 +71,8 @@ fn a_hand_that_would_press_on_its_block_continues() {
     );
 }
 
-/// Returns the smallest horizontal distance of `point` from 100 points of the way from `from` to `to`, metres.
-fn distance_to_way_m(point: DVec3, from: DVec3, to: DVec3) -> f64 {
+/// Returns the smallest horizontal distance of `point` from 100 points of the line from `from` to `to`, metres.
+fn distance_to_line_m(point: DVec3, from: DVec3, to: DVec3) -> f64 {
     let part = |step: u32| from.lerp(to, f64::from(step) / 100.0) - point;
     (0..=100).map(|step| part(step).truncate().length()).fold(f64::INFINITY, f64::min)
 }
@@ -91,7 +91,7 @@ fn one_arm_waits_where_pushed_objects_could_meet() {
         let report = trials.run(number, &mut idle, &mut NoObserver).unwrap();
         let room_m = |first: usize| {
             let (one, other) = (&report.positions[first], &report.positions[1 - first]);
-            distance_to_way_m(other.start, one.start, one.goal).min(distance_to_way_m(
+            distance_to_line_m(other.start, one.start, one.goal).min(distance_to_line_m(
                 one.goal,
                 other.start,
                 other.goal,

@@ -1,6 +1,7 @@
 //! Turns a request into a checked motion.
 
 use tandem_kinematics::plan::MAX_WAYPOINTS;
+use tandem_kinematics::trajectory::DEFAULT_RATE_HZ;
 use tandem_kinematics::{
     ArmSample, ArmWaypoint, ForwardKinematics, Joints, Motion, PlanError, PlanSettings, Waypoint,
     WorkCell, plan,
@@ -12,8 +13,6 @@ use crate::executor::{CheckError, CheckedMotion, Checker};
 
 /// The largest number of samples of a joint motion: ten minutes at 100 samples per second.
 const MAX_SAMPLES: usize = 60_001;
-/// Samples per second of planned motions.
-const RATE_HZ: f64 = 100.0;
 
 /// The motion that a client requests.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,7 +90,8 @@ impl MotionSpec {
                     planned.map_err(|error| MotionError::Plan(renumbered(error, from_here)))?;
                 // The check will refuse a long motion: do not spend memory on its samples.
                 let longest_s = checker.settings().check.duration_s;
-                let rate_hz = if planned.duration_s() > 2.0 * longest_s { 1.0 } else { RATE_HZ };
+                let rate_hz =
+                    if planned.duration_s() > 2.0 * longest_s { 1.0 } else { DEFAULT_RATE_HZ };
                 planned.sampled(rate_hz)
             }
         };

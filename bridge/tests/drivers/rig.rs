@@ -202,7 +202,7 @@ pub(crate) fn sweep(openings: [f64; 4]) -> Motion {
         [DVec3::new(-0.05, 0.02, 0.10), DVec3::new(-0.02, -0.02, 0.10)],
     ];
     let waypoint = |(own, opening): (&[DVec3; 2], f64)| {
-        let tool = |arm: usize| cell.world_from_own(ArmIndex(arm), &own[arm].into());
+        let tool = |arm: usize| cell.world_from_arm(ArmIndex(arm), &own[arm].into());
         [0, 1]
             .map(|arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening })
             .to_vec()

@@ -115,7 +115,7 @@ pub(crate) fn planned(points: &[([DVec3; 2], f64)]) -> Motion {
     motion
 }
 
-/// An area of random motions in the arms' own frames: low and high corner, metres.
+/// An area of random motions in the arm frames: low and high corner, metres.
 pub(crate) type Area = [DVec3; 2];
 
 /// The complete area of the tasks.
@@ -141,7 +141,7 @@ pub(crate) fn walk([low, high]: Area, seed: u64, n: usize) -> Motion {
             }
             let opening = f64::from(uniform(&mut rng, 0.0, 1.0));
             let tool =
-                |arm: usize| cell.world_from_own(tandem_core::ArmIndex(arm), &own[arm].into());
+                |arm: usize| cell.world_from_arm(tandem_core::ArmIndex(arm), &own[arm].into());
             let waypoint =
                 |arm| ArmWaypoint { tool_in_world_m: tool(arm), gripper_opening: opening };
             waypoints.push(vec![waypoint(0), waypoint(1)]);

@@ -124,7 +124,7 @@ fn an_interruption_stops_the_arms_on_their_way() {
 fn a_start_without_a_checked_way_is_refused() {
     // Both hands at the same place.
     let cell = mico_cell();
-    let middle = cell.world_from_own(ArmIndex(0), &[0.12, 0.0, 0.05].into());
+    let middle = cell.world_from_arm(ArmIndex(0), &[0.12, 0.0, 0.05].into());
     let start: Vec<Joints> = [0, 1]
         .map(|arm| {
             let model = cell.arms[arm].model;

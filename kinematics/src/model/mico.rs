@@ -53,13 +53,13 @@ const HAND_RADIUS_M: f64 = 0.045;
 /// The length of the hand's shell from the last joint towards the fingers, metres.
 const HAND_LENGTH_M: f64 = 0.10;
 /// The fingers at any opening. Their hinges are 0.115 m from the last joint and the fingers are about 0.089 m long, so
-/// they end at most 0.044 m beyond the tool's origin (shut and straight) or, wide open, about 0.0875 m to each side.
+/// they end at most 0.044 m beyond the tool's origin (closed and straight) or, wide open, about 0.0875 m to each side.
 const FINGERS_RADIUS_M: f64 = 0.035;
 const FINGERS_ASIDE_M: f64 = 0.0525;
 const FINGERS_AHEAD_M: f64 = 0.0085;
-/// A shut gripper extends 52.5 mm to each side: the hinges are 31 mm from the middle, the fingers about 10 mm thick,
+/// A closed gripper extends 52.5 mm to each side: the hinges are 31 mm from the middle, the fingers about 10 mm thick,
 /// and a centimetre is added. The modelled width is linear in the opening, and the hinged fingers are never wider.
-const FINGERS_SHUT_SHARE: f64 = 1.0 / 3.0;
+const FINGERS_CLOSED_SHARE: f64 = 1.0 / 3.0;
 
 static LINKS: [Link; 5] = [
     link("base", Anchor::origin_of(0), Anchor::origin_of(2), BASE_RADIUS_M),
@@ -67,7 +67,7 @@ static LINKS: [Link; 5] = [
     link("forearm", Anchor::origin_of(3), Anchor::origin_of(4), FOREARM_RADIUS_M),
     link("hand", Anchor::origin_of(4), anchor(4, [0.0, 0.0, -HAND_LENGTH_M]), HAND_RADIUS_M),
     Link {
-        shut_share: FINGERS_SHUT_SHARE,
+        closed_share: FINGERS_CLOSED_SHARE,
         ..link(
             "gripper",
             anchor(5, [-FINGERS_ASIDE_M, 0.0, FINGERS_AHEAD_M]),
@@ -115,7 +115,7 @@ const fn anchor(frame: usize, [x, y, z]: [f64; 3]) -> Anchor {
 }
 
 const fn link(name: &'static str, from: Anchor, to: Anchor, radius_m: f64) -> Link {
-    Link { name, ends: [from, to], radius_m, shut_share: 1.0 }
+    Link { name, ends: [from, to], radius_m, closed_share: 1.0 }
 }
 
 const fn pair(links: [usize; 2], allowance_m: f64) -> SelfPair {

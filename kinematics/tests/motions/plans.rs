@@ -93,7 +93,6 @@ fn the_tool_follows_the_lines_between_waypoints_to_two_and_a_half_millimetres() 
     for seed in 0..20 {
         let waypoints = walk(&cell, Area::TASKS, seed, 50);
         let trajectory = planned(&cell, &waypoints, &PlanSettings::default());
-        assert_eq!(trajectory.n_waypoints(), 50);
         for (idx, waypoint) in waypoints.iter().enumerate() {
             let states = trajectory.at(trajectory.waypoint_s(idx));
             for (arm, state) in states.iter().enumerate() {
@@ -153,12 +152,12 @@ fn a_straight_line_uses_some_limit_almost_fully() {
     }
 }
 
-/// Returns waypoints of both arms on a line in their own frames. The grippers are shut from the middle on.
+/// Returns waypoints of both arms on a line in the arm frames. The grippers are closed from the middle on.
 fn line(cell: &WorkCell, from: Point3<f64>, to: Point3<f64>, n: u32) -> Vec<Waypoint> {
     let at = |idx: u32| {
         let share = f64::from(idx) / f64::from(n - 1);
         let waypoint = |arm| ArmWaypoint {
-            tool_in_world_m: cell.world_from_own(ArmIndex(arm), &from.lerp(&to, share)),
+            tool_in_world_m: cell.world_from_arm(ArmIndex(arm), &from.lerp(&to, share)),
             gripper_opening: f64::from(u32::from(2 * idx < n)),
         };
         (0..cell.arms.len()).map(waypoint).collect()

@@ -12,7 +12,7 @@ use tandem_kinematics::{
 /// Longest step of a walk, metres: that of one action.
 const STEP_M: f64 = 0.05;
 
-/// A box in the own frame, metres of the training world.
+/// A box in the arm frame, metres of the training world.
 #[derive(Clone, Copy)]
 pub(crate) struct Area {
     pub(crate) low: Vector3<f64>,
@@ -36,26 +36,26 @@ impl Area {
 /// Returns `n` waypoints of both arms: steps of up to 5 cm within the area, and a new gripper opening every 7 steps.
 pub(crate) fn walk(cell: &WorkCell, area: Area, seed: u64, n: usize) -> Vec<Waypoint> {
     let mut rng = episode_rng(seed, 0, Stream::Exploration);
-    let mut own: Vec<Vector3<f64>> = cell.arms.iter().map(|_| area.point(&mut rng)).collect();
+    let mut in_arm: Vec<Vector3<f64>> = cell.arms.iter().map(|_| area.point(&mut rng)).collect();
     let mut opening = 1.0;
     let longest = STEP_M / cell.task_frame.scale;
     (0..n)
         .map(|step| {
             if step > 0 {
-                for own in &mut own {
+                for in_arm in &mut in_arm {
                     let random = Vector3::from([0; 3].map(|_| rng.random_range(-1.0..1.0)));
-                    let moved = *own + random.cap_magnitude(1.0) * longest;
-                    *own = moved.sup(&area.low).inf(&area.high);
+                    let moved = *in_arm + random.cap_magnitude(1.0) * longest;
+                    *in_arm = moved.sup(&area.low).inf(&area.high);
                 }
             }
             if step % 7 == 6 {
                 opening = rng.random_range(0.0..=1.0);
             }
-            let waypoint = |(arm, own): (usize, &Vector3<f64>)| ArmWaypoint {
-                tool_in_world_m: cell.world_from_own(ArmIndex(arm), &Point3::from(*own)),
+            let waypoint = |(arm, in_arm): (usize, &Vector3<f64>)| ArmWaypoint {
+                tool_in_world_m: cell.world_from_arm(ArmIndex(arm), &Point3::from(*in_arm)),
                 gripper_opening: opening,
             };
-            own.iter().enumerate().map(waypoint).collect()
+            in_arm.iter().enumerate().map(waypoint).collect()
         })
         .collect()
 }

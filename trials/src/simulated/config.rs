@@ -49,7 +49,7 @@ pub struct SimulatedConfig {
     pub shared: Option<SharedObject>,
 }
 
-/// A gripper with two fingers that slide along y of the arm's own frame.
+/// A gripper with two fingers that slide along y of the arm frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GripperConfig {
     /// Force with which each finger presses, newtons.
@@ -70,9 +70,9 @@ pub struct CameraConfig {
     /// Periods from a picture until its objects are available.
     pub latency_periods: u64,
     /// Standard deviation of an observed position along each axis, metres.
-    pub place_noise_m: f64,
+    pub position_noise_m: f64,
     /// Standard deviation of an observed orientation about each axis, radians.
-    pub turn_noise_rad: f64,
+    pub orientation_noise_rad: f64,
 }
 
 /// A cube.
@@ -168,7 +168,12 @@ impl Default for GripperConfig {
 
 impl Default for CameraConfig {
     fn default() -> Self {
-        Self { every_periods: 3, latency_periods: 5, place_noise_m: 0.001, turn_noise_rad: 0.01 }
+        Self {
+            every_periods: 3,
+            latency_periods: 5,
+            position_noise_m: 0.001,
+            orientation_noise_rad: 0.01,
+        }
     }
 }
 

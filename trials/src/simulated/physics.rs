@@ -18,11 +18,16 @@ use rapier3d::math::{Matrix, Pose, Rotation, Vector};
 use rapier3d::pipeline::PhysicsPipeline;
 
 use crate::simulated::config::{Block, GripperConfig, SharedObject, SimulatedConfig};
+use crate::simulated::single;
 
 /// The largest opening of each finger's pad, metres.
 pub const MAX_OPENING_M: f32 = 0.062;
 /// Half extents of a pad: along the closing direction, across it, along the hand; metres.
-pub(crate) const PAD_HALF_M: Vector = Vector::new(0.005, 0.008, 0.015);
+pub(crate) const PAD_HALF_M: DVec3 = DVec3::new(0.005, 0.008, 0.015);
+/// The same in the precision of the physics.
+#[expect(clippy::cast_possible_truncation, reason = "rounds to single precision")]
+const PAD_HALF_SINGLE_M: Vector =
+    Vector::new(PAD_HALF_M.x as f32, PAD_HALF_M.y as f32, PAD_HALF_M.z as f32);
 /// The distance of the pads' centres ahead of the tool's origin, metres.
 pub(crate) const PAD_AHEAD_M: f32 = 0.021;
 /// Half extents of the hand's shell, in the tool's axes, metres.
@@ -220,7 +225,7 @@ impl PhysicsWorld {
         let hand = &self.hands[arm];
         let at = self.bodies[hand.body].position();
         let shell = *at * Pose::from_parts(Vector::Z * -HAND_BEHIND_M, Rotation::IDENTITY);
-        let pad = |finger: &Finger| (*self.bodies[finger.body].position(), PAD_HALF_M);
+        let pad = |finger: &Finger| (*self.bodies[finger.body].position(), PAD_HALF_SINGLE_M);
         [(shell, HAND_HALF_M), pad(&hand.fingers[0]), pad(&hand.fingers[1])]
     }
 
@@ -235,7 +240,7 @@ impl PhysicsWorld {
         [0, 1].map(|idx| {
             let finger = &hand.fingers[idx];
             let offset = at.inv_mul(self.bodies[finger.body].position()).translation;
-            offset.x * finger.side - PAD_HALF_M.x
+            offset.x * finger.side - PAD_HALF_SINGLE_M.x
         })
     }
 
@@ -277,20 +282,21 @@ impl PhysicsWorld {
         ];
         let opening_m = opening * MAX_OPENING_M;
         let fingers = [1.0, -1.0].map(|side| {
-            let shut = Vector::new(side * PAD_HALF_M.x, 0.0, PAD_AHEAD_M);
-            let offset = shut + Vector::X * (side * opening_m);
+            let closed = Vector::new(side * PAD_HALF_SINGLE_M.x, 0.0, PAD_AHEAD_M);
+            let offset = closed + Vector::X * (side * opening_m);
             let pose = poses.hand() * Pose::from_parts(offset, Rotation::IDENTITY);
             let finger = self
                 .bodies
                 .insert(RigidBodyBuilder::dynamic().pose(pose).gravity_scale(0.0).can_sleep(false));
-            let pad = ColliderBuilder::cuboid(PAD_HALF_M.x, PAD_HALF_M.y, PAD_HALF_M.z)
+            let half = PAD_HALF_SINGLE_M;
+            let pad = ColliderBuilder::cuboid(half.x, half.y, half.z)
                 .mass(gripper.finger_kg)
                 .friction(gripper.pad_friction)
                 .friction_combine_rule(CoefficientCombineRule::Max)
                 .collision_groups(groups(group, others));
             colliders.push(self.colliders.insert_with_parent(pad, finger, &mut self.bodies));
             let slide = PrismaticJointBuilder::new(Vector::X * side)
-                .local_anchor1(shut)
+                .local_anchor1(closed)
                 .local_anchor2(Vector::ZERO)
                 .contacts_enabled(false)
                 .limits([0.0, MAX_OPENING_M])
@@ -315,8 +321,8 @@ impl PhysicsWorld {
     }
 
     fn add_shared(&mut self, object: &SharedObject, friction: f32) {
-        let turn = Rotation::from_rotation_z(object.yaw_rad);
-        let pose = Pose::from_parts(Vector::from_array(object.at_m), turn);
+        let rotation = Rotation::from_rotation_z(object.yaw_rad);
+        let pose = Pose::from_parts(Vector::from_array(object.at_m), rotation);
         let body = self.bodies.insert(RigidBodyBuilder::dynamic().pose(pose).can_sleep(false));
         for part in &object.boxes {
             let part = object_box(Vector::from_array(part.half_m), part.mass_kg, friction)
@@ -346,8 +352,8 @@ impl ArmPoses {
     fn forearm(&self) -> Pose {
         let [from, to] = self.forearm_m;
         let along = (to - from).normalize().as_vec3();
-        let turn = Rotation::from_rotation_arc(Vector::Z, along);
-        Pose::from_parts((0.5 * (from + to)).as_vec3(), turn)
+        let rotation = Rotation::from_rotation_arc(Vector::Z, along);
+        Pose::from_parts((0.5 * (from + to)).as_vec3(), rotation)
     }
 }
 
@@ -363,13 +369,9 @@ fn object_box(half_m: Vector, mass_kg: f32, friction: f32) -> ColliderBuilder {
 /// Returns `pose` with the quaternion of its rotation that is nearer to `from`. Rapier would interpret the other one as
 /// a full turn.
 fn nearest(pose: &Pose, from: &Pose) -> Pose {
-    let turn = if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
-    Pose::from_parts(pose.translation, turn)
-}
-
-/// Converts to the single precision of the physics.
-fn single(value: f64) -> f32 {
-    DVec3::splat(value).as_vec3().x
+    let rotation =
+        if pose.rotation.dot(from.rotation) < 0.0 { -pose.rotation } else { pose.rotation };
+    Pose::from_parts(pose.translation, rotation)
 }
 
 fn groups(member: Group, of: Group) -> InteractionGroups {
@@ -405,12 +407,13 @@ mod tests {
         let [from, to] = [0, 1].map(|end| DVec3::from(fingers.ends[end].offset_m));
         let middle = 0.5 * (from + to);
         for opening in [0.0_f32, 0.25, 0.5, 0.75, 1.0] {
-            let share = fingers.shut_share + f64::from(opening) * (1.0 - fingers.shut_share);
+            let share = fingers.closed_share + f64::from(opening) * (1.0 - fingers.closed_share);
             let [from, to] = [from, to].map(|end| middle + share * (end - middle));
             for corner in 0..8_u32 {
                 let side = |bit: u32| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 };
-                let centre = Vector::new(PAD_HALF_M.x + opening * MAX_OPENING_M, 0.0, PAD_AHEAD_M);
-                let corner = centre + PAD_HALF_M * Vector::new(side(0), side(1), side(2));
+                let centre =
+                    Vector::new(PAD_HALF_SINGLE_M.x + opening * MAX_OPENING_M, 0.0, PAD_AHEAD_M);
+                let corner = centre + PAD_HALF_SINGLE_M * Vector::new(side(0), side(1), side(2));
                 let corner = corner.as_dvec3();
                 let on_line = corner.clamp(from.min(to), from.max(to));
                 let distance_m = (corner - on_line).length();

@@ -7,6 +7,7 @@ use tandem_kinematics::model::Anchor;
 use tandem_kinematics::{ForwardKinematics, Joints, PlacedArm, WorkCell};
 
 use crate::simulated::physics::{PhysicsWorld, TABLE_HALF_M};
+use crate::simulated::single;
 
 /// Returns the scene with the arms at joint angles `angles` (radians) at `time_s`, without goals.
 pub(crate) fn scene(
@@ -31,17 +32,18 @@ pub(crate) fn scene(
 
 fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> ArmScene {
     let posture = ForwardKinematics::new(placed.model, angles);
-    let point =
-        |anchor: &Anchor| single((placed.world_from_base() * posture.anchor_m(anchor)).into());
+    let point = |anchor: &Anchor| {
+        single_point((placed.world_from_base() * posture.anchor_m(anchor)).into())
+    };
     let origin = |frame| point(&Anchor::origin_of(frame));
     let links = placed.model.links.iter().map(|link| Capsule {
         from: point(&link.ends[0]),
         to: point(&link.ends[1]),
-        radius_m: DVec3::splat(link.radius_m).as_vec3().x,
+        radius_m: single(link.radius_m),
     });
     let n_joints = angles.len();
     ArmScene {
-        base: single(placed.base_in_world_m.into()),
+        base: single_point(placed.base_in_world_m.into()),
         joint_angles_rad: std::array::from_fn(|joint| angles.get(joint).copied().unwrap_or(0.0)),
         joint_points: (0..=n_joints + 1).map(origin).collect(),
         links: links.collect(),
@@ -50,7 +52,7 @@ fn arm_scene(placed: &PlacedArm, angles: &Joints, hand: [(Pose, Vector); 3]) -> 
     }
 }
 
-fn single(point: DVec3) -> Point {
+fn single_point(point: DVec3) -> Point {
     point.as_vec3().to_array()
 }
 

@@ -17,7 +17,7 @@ pub struct ObjectPose {
     /// The centre, world frame, metres.
     pub at_m: DVec3,
     /// The orientation, world frame.
-    pub turn: DQuat,
+    pub orientation: DQuat,
     /// The simulated time of the pose, seconds.
     pub time_s: f64,
 }
@@ -90,12 +90,13 @@ impl Cameras {
     }
 
     fn with_noise(&mut self, mut objects: Vec<ObjectPose>) -> Vec<ObjectPose> {
-        let CameraConfig { place_noise_m, turn_noise_rad, .. } = self.config;
+        let CameraConfig { position_noise_m, orientation_noise_rad, .. } = self.config;
         let mut normal = || f64::from(standard_normal(&mut self.rng));
         for object in &mut objects {
-            object.at_m += DVec3::new(normal(), normal(), normal()) * place_noise_m;
-            let turn = DVec3::new(normal(), normal(), normal()) * turn_noise_rad;
-            object.turn = (DQuat::from_scaled_axis(turn) * object.turn).normalize();
+            object.at_m += DVec3::new(normal(), normal(), normal()) * position_noise_m;
+            let error = DVec3::new(normal(), normal(), normal()) * orientation_noise_rad;
+            let error = DQuat::from_scaled_axis(error);
+            object.orientation = (error * object.orientation).normalize();
         }
         objects
     }

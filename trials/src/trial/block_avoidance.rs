@@ -1,32 +1,32 @@
 //! The path of one step around the blocks: sideways before down, and down only where there is room.
 //!
 //! In the training world a hand that descends on a block rests on it and slides along. An arm would press until the
-//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, raised before if its
-//! pads or the block that they hold would graze the other block, and stays just above a block that these would touch. A
-//! hand beside a block moves down first and then sideways, because pads that descend along a block's side press it onto
-//! the table. A hand that holds a block lowers it to the table and no further.
+//! envelope stops it. A hand above the top of a block that it crosses therefore moves sideways first, raised before if
+//! its pads or the block that they hold would graze the other block, and stays just above a block that these would
+//! touch. A hand beside a block moves down first and then sideways, because pads that descend along a block's side
+//! press it onto the table. A hand that holds a block lowers it to the table and no further.
 
 use glam::{DMat3, DVec2, DVec3};
 
-/// Half extents of a pad: along the closing direction, across it, along the hand; metres.
-const PAD_HALF_M: DVec3 = DVec3::new(0.005, 0.008, 0.015);
+use crate::simulated::PAD_HALF_M;
+
 /// Distances that are kept beside and above a block, metres.
-const BESIDE_M: f64 = 0.003;
-const ABOVE_M: f64 = 0.004;
+const CLEARANCE_BESIDE_M: f64 = 0.003;
+const CLEARANCE_ABOVE_M: f64 = 0.004;
 /// Closed pads hold a block whose centre is horizontally within this distance, metres.
-const HELD_WITHIN_M: f64 = 0.025;
+const HOLDING_DISTANCE_M: f64 = 0.025;
 /// The number of parts of a step at whose ends pads are compared with a block.
 const N_PARTS: u32 = 8;
 /// A hand is held up if it ends this far above its wanted position, metres.
-const HELD_UP_M: f64 = 0.01;
+const HELD_UP_HEIGHT_M: f64 = 0.01;
 /// Height above the table at which a held block counts as set down, metres, because cameras are not exact.
-const SET_DOWN_M: f64 = 0.002;
+const SET_DOWN_HEIGHT_M: f64 = 0.002;
 
 /// A block as observed, world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ObservedBlock {
     /// The centre, metres.
-    pub(crate) at: DVec3,
+    pub(crate) position: DVec3,
     /// The rotation about the vertical axis, radians.
     pub(crate) yaw_rad: f64,
     /// Half the edges, along the block's own axes, metres.
@@ -49,7 +49,7 @@ pub(crate) struct Pads {
 
 /// The path of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Way {
+pub(crate) struct StepPath {
     /// Two corners and the end of the path of the point between the pads, world frame, metres.
     pub(crate) points: [DVec3; 3],
     /// Whether a block keeps the hand from reaching its wanted position.
@@ -63,11 +63,11 @@ pub(crate) fn lowered(from: &Pads, to: DVec3, blocks: &[ObservedBlock]) -> DVec3
 }
 
 /// Returns the path of the point between the pads from `from` towards `to`.
-pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> Way {
+pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> StepPath {
     let start = from.centre;
     let to = Pads { centre: lowered(from, to.centre, blocks), ..*to };
     let end = to.centre;
-    let free = |corner| Way { points: [start, corner, end], is_held_up: false };
+    let free = |corner| StepPath { points: [start, corner, end], is_held_up: false };
     if end.z >= start.z {
         return free(start.midpoint(end));
     }
@@ -84,7 +84,7 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
         from.crosses(&to, block) || bodies[2..].iter().any(|(one, then)| one.crosses(then, block))
     };
     for block in others.iter().filter(is_met) {
-        let over_m = block.top_m() + ABOVE_M;
+        let over_m = block.top_m() + CLEARANCE_ABOVE_M;
         let any_above = bodies.iter().any(|(before, _)| before.is_above(block));
         for (before, after) in &bodies {
             let crosses = || any_above && !before.overlaps(block) && before.crosses(after, block);
@@ -103,27 +103,27 @@ pub(crate) fn avoid_blocks(from: &Pads, to: &Pads, blocks: &[ObservedBlock]) -> 
     let highest_m = start.z + lift_m;
     let last = end.with_z(end.z.max(lowest_m.min(highest_m)));
     let points = [start.with_z(highest_m), last.with_z(highest_m), last];
-    Way { points, is_held_up: last.z > end.z + HELD_UP_M }
+    StepPath { points, is_held_up: last.z > end.z + HELD_UP_HEIGHT_M }
 }
 
 impl ObservedBlock {
     /// The distance by which the block can be lowered, metres.
     fn room_m(&self) -> f64 {
-        (self.at.z - self.half_m.z - SET_DOWN_M).max(0.0)
+        (self.position.z - self.half_m.z - SET_DOWN_HEIGHT_M).max(0.0)
     }
 
     fn top_m(&self) -> f64 {
-        self.at.z + self.half_m.z
+        self.position.z + self.half_m.z
     }
 }
 
 impl Pads {
     /// Returns whether the pads hold `block`.
     fn hold(&self, block: &ObservedBlock) -> bool {
-        let offset = block.at - self.centre;
+        let offset = block.position - self.centre;
         let longer_m = (block.half_m.x - block.half_m.y).max(0.0);
         self.commanded_m <= block.half_m.y
-            && offset.truncate().length() < HELD_WITHIN_M + longer_m
+            && offset.truncate().length() < HOLDING_DISTANCE_M + longer_m
             && offset.z.abs() < block.half_m.z
     }
 
@@ -158,7 +158,7 @@ impl Body {
     /// `block`, displaced by `by`.
     fn at(block: &ObservedBlock, by: DVec3) -> Self {
         let axes = DMat3::from_rotation_z(block.yaw_rad);
-        Self { centre: block.at + by, axes, half_m: block.half_m }
+        Self { centre: block.position + by, axes, half_m: block.half_m }
     }
 
     /// The height of the lowest corner.
@@ -167,7 +167,7 @@ impl Body {
     }
 
     fn is_above(&self, block: &ObservedBlock) -> bool {
-        self.lowest_m() >= block.top_m() - ABOVE_M
+        self.lowest_m() >= block.top_m() - CLEARANCE_ABOVE_M
     }
 
     /// Half the width along `axis`.
@@ -177,10 +177,12 @@ impl Body {
 
     /// Returns whether the body is above `block` or too near to it, seen from above.
     fn overlaps(&self, block: &ObservedBlock) -> bool {
-        let cube =
-            Rectangle { along: direction(block.yaw_rad), half: block.half_m.truncate() + BESIDE_M };
+        let cube = Rectangle {
+            along: direction(block.yaw_rad),
+            half: block.half_m.truncate() + CLEARANCE_BESIDE_M,
+        };
         let closing = self.axes.x_axis.truncate().normalize_or(DVec2::X);
-        let apart = (block.at - self.centre).truncate();
+        let apart = (block.position - self.centre).truncate();
         [closing, closing.perp(), cube.along, cube.along.perp()].into_iter().all(|axis| {
             apart.dot(axis).abs() < self.half_width_m(axis.extend(0.0)) + cube.half_width_m(axis)
         })
@@ -224,7 +226,7 @@ mod tests {
     use super::*;
 
     const BLOCK: ObservedBlock = ObservedBlock {
-        at: DVec3::new(0.1, 0.0, 0.028),
+        position: DVec3::new(0.1, 0.0, 0.028),
         yaw_rad: 0.0,
         half_m: DVec3::splat(0.028),
     };
@@ -241,10 +243,13 @@ mod tests {
         let path =
             |opening_m, block| avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block]);
         let open = path(0.05, BLOCK);
-        assert_eq!(open, Way { points: [from, DVec3::new(0.1, 0.0, 0.12), to], is_held_up: false });
+        assert_eq!(
+            open,
+            StepPath { points: [from, DVec3::new(0.1, 0.0, 0.12), to], is_held_up: false }
+        );
         let closed = path(0.0, BLOCK);
         let end = closed.points[2];
-        assert!((end.z - (0.056 + PAD_HALF_M.z + ABOVE_M)).abs() < 1e-12, "{end}");
+        assert!((end.z - (0.056 + PAD_HALF_M.z + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{end}");
         assert!(closed.is_held_up);
         let turned = ObservedBlock { yaw_rad: std::f64::consts::FRAC_PI_4, ..BLOCK };
         assert_eq!(path(0.033, BLOCK).points[2], to);
@@ -263,7 +268,7 @@ mod tests {
         let [.., end] = avoid_blocks(&from, &to, &[BLOCK]).points;
         let lower = tilted(end).each().map(|pad| pad.lowest_m());
         assert!(lower[0] < lower[1] - 0.03, "{lower:?}");
-        assert!((lower[0] - (0.056 + ABOVE_M)).abs() < 1e-12, "{lower:?}");
+        assert!((lower[0] - (0.056 + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{lower:?}");
     }
 
     #[test]
@@ -287,30 +292,34 @@ mod tests {
         let (from, to) = (tilted(from), tilted(DVec3::new(0.1, 0.03, 0.05)));
         let is_above = from.each().map(|pad| pad.is_above(&BLOCK));
         assert_eq!(is_above, [true, false]);
-        let way = avoid_blocks(&from, &to, &[BLOCK]);
-        let lowest_m = tilted(way.points[2]).each().map(|pad| pad.lowest_m());
-        assert!(lowest_m[1] >= 0.056 + ABOVE_M - 1e-12, "{lowest_m:?}");
-        assert!(way.is_held_up);
+        let path = avoid_blocks(&from, &to, &[BLOCK]);
+        let lowest_m = tilted(path.points[2]).each().map(|pad| pad.lowest_m());
+        assert!(lowest_m[1] >= 0.056 + CLEARANCE_ABOVE_M - 1e-12, "{lowest_m:?}");
+        assert!(path.is_held_up);
     }
 
     #[test]
     fn a_held_block_passes_over_another_one() {
         let from = DVec3::new(0.1, 0.07, 0.09);
-        let held = ObservedBlock { at: from, ..BLOCK };
+        let held = ObservedBlock { position: from, ..BLOCK };
         let holding = |centre| Pads { commanded_m: 0.0, ..pads(centre, 0.028) };
         let to = DVec3::new(0.1, 0.0, 0.05);
-        let way = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
-        let lowest_m = way.points[2].z - 0.028;
-        assert!((lowest_m - (0.056 + ABOVE_M)).abs() < 1e-12, "{lowest_m}");
-        assert!(way.is_held_up);
+        let path = avoid_blocks(&holding(from), &holding(to), &[held, BLOCK]);
+        let lowest_m = path.points[2].z - 0.028;
+        assert!((lowest_m - (0.056 + CLEARANCE_ABOVE_M)).abs() < 1e-12, "{lowest_m}");
+        assert!(path.is_held_up);
         let alone = avoid_blocks(&holding(from), &holding(to), &[held]);
         assert_eq!(alone.points[2], to);
     }
 
     #[test]
     fn a_block_that_a_hand_does_not_cross_does_not_change_its_path() {
-        let far = ObservedBlock { at: BLOCK.at + DVec3::Y * 0.3, ..BLOCK };
-        let high = ObservedBlock { half_m: DVec3::splat(0.04), at: BLOCK.at.with_z(0.04), ..BLOCK };
+        let far = ObservedBlock { position: BLOCK.position + DVec3::Y * 0.3, ..BLOCK };
+        let high = ObservedBlock {
+            half_m: DVec3::splat(0.04),
+            position: BLOCK.position.with_z(0.04),
+            ..BLOCK
+        };
         let from = DVec3::new(0.03, 0.0, 0.072);
         let path = |blocks: &[ObservedBlock]| {
             avoid_blocks(&pads(from, 0.0), &pads(DVec3::new(0.08, 0.0, 0.03), 0.0), blocks)
@@ -324,13 +333,13 @@ mod tests {
 
     #[test]
     fn a_held_block_is_lowered_to_the_table_and_no_further() {
-        let held = ObservedBlock { at: BLOCK.at.with_z(0.06), ..BLOCK };
+        let held = ObservedBlock { position: BLOCK.position.with_z(0.06), ..BLOCK };
         let from = DVec3::new(0.1, 0.005, 0.07);
         let path = |opening_m, to, block| {
             avoid_blocks(&pads(from, opening_m), &pads(to, opening_m), &[block])
         };
         let [.., end] = path(0.02, from.with_z(0.03), held).points;
-        assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_M))).abs() < 1e-12, "{end}");
+        assert!((end.z - (0.07 - (0.06 - 0.028 - SET_DOWN_HEIGHT_M))).abs() < 1e-12, "{end}");
         let [.., end] = path(0.05, from.with_z(0.04), BLOCK).points;
         assert!((end.z - 0.04).abs() < 1e-12, "nothing is held by an open gripper");
     }

@@ -1,23 +1,20 @@
 //! The steps of the closed loop: each observes, asks the policy and moves the arms. [`episodes`] repeats them.
 
-use glam::{DMat3, DVec3, EulerRot};
+use glam::{DVec3, EulerRot};
 use rand_chacha::ChaCha8Rng;
 use tandem_core::ArmIndex;
 use tandem_core::scene::Cuboid;
-use tandem_kinematics::{
-    ArmWaypoint, CheckSettings, ForwardKinematics, Joints, PlacedArm, ReachError, Waypoint,
-};
+use tandem_kinematics::{Joints, Waypoint};
 
 use self::progress::Progress;
-use crate::simulated::{MAX_OPENING_M, ObjectPose, SharedObject};
+use crate::simulated::{ObjectPose, SharedObject};
 use crate::trial::ActionSource;
-use crate::trial::block_avoidance::{ObservedBlock, Pads, Way, avoid_blocks, lowered};
+use crate::trial::block_avoidance::ObservedBlock;
 use crate::trial::mapping::ArmObservation;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
-use crate::trial::rig::{TrialRig, tool_positions};
-use crate::trial::runner::{TrialRunner, unreachable};
-use crate::trial::shared_object::keep_distance;
+use crate::trial::rig::TrialRig;
+use crate::trial::runner::TrialRunner;
 
 mod episodes;
 mod grasping;
@@ -27,55 +24,29 @@ mod progress;
 mod recalling;
 mod sparing;
 mod squeezing;
+mod step_motion;
 mod yielding;
 
 /// Share of the tolerance of its goal within which an object counts as placed.
 const DONE_SHARE: f64 = 0.9;
-/// Displacements (metres) and changes of the opening (shares) below which a step needs no motion.
-const STILL_M: f64 = 5e-4;
-const STILL_OPENING: f64 = 0.005;
-/// The displacement of an arm that makes room, own frame, metres.
-const BACK_M: DVec3 = DVec3::new(-0.03, 0.0, 0.015);
 
-/// The displacements of an arm that stays or withdraws from the other one, own frame, metres.
-const APART_M: [DVec3; 5] = [
-    DVec3::ZERO,
-    DVec3::new(-0.04, 0.0, 0.02),
-    DVec3::new(0.0, 0.0, 0.05),
-    DVec3::new(0.0, -0.04, 0.03),
-    DVec3::new(0.0, 0.04, 0.03),
-];
-
-/// The part of a step that an arm carries out.
-#[derive(Clone, Copy)]
-enum StepPart {
-    /// This share of the policy's displacement.
-    Share(f64),
-    /// Makes room for the other arm.
-    Back,
+/// The closed loop of one trial. Its methods move the arms; those of the runner decide how.
+pub(super) struct ClosedLoop<'a, 'rig> {
+    runner: &'a TrialRunner,
+    rig: &'a mut TrialRig<'rig>,
+    start: &'a TrialStart,
+    policy: &'a mut dyn ActionSource,
+    state: LoopState,
+    /// The number of steps, and of those that the arms did not carry out in full.
+    n_steps: usize,
+    n_shortened: usize,
+    /// Whether the time limit has passed.
+    timed_out: bool,
 }
-
-/// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all, so
-/// only the first three remain.
-const ATTEMPTS: [[StepPart; 2]; 10] = {
-    use StepPart::{Back, Share};
-    [
-        [Share(1.0), Share(1.0)],
-        [Share(0.5), Share(0.5)],
-        [Share(0.2), Share(0.2)],
-        [Share(1.0), Share(0.0)],
-        [Share(0.0), Share(1.0)],
-        [Share(0.4), Share(0.0)],
-        [Share(0.0), Share(0.4)],
-        [Share(0.6), Back],
-        [Back, Share(0.6)],
-        [Back, Back],
-    ]
-};
 
 /// What the policy wants in a step, and what is in the way.
 struct WantedStep<'a> {
-    /// The end effectors after the step, own frames, metres.
+    /// The end effectors after the step, arm frames, metres.
     hands: Vec<DVec3>,
     /// The openings after the step, metres on each side.
     openings_m: Vec<f64>,
@@ -85,10 +56,10 @@ struct WantedStep<'a> {
 /// The state of the closed loop.
 struct LoopState {
     /// The commanded joint angles, radians.
-    at: Vec<Joints>,
+    joint_angles: Vec<Joints>,
     /// The commanded openings, metres on each side.
     openings_m: Vec<f64>,
-    /// The velocities of the training world's hands, own frames, metres per second.
+    /// The velocities of the training world's hands, arm frames, metres per second.
     velocities: Vec<DVec3>,
     before: Option<Vec<ArmObservation>>,
     /// The number of consecutive observations with every object at its goal.
@@ -100,7 +71,7 @@ struct LoopState {
     progress: Progress,
     /// Whether each gripper opens only as wide as its object needs, because another object lies next to it.
     narrow: Vec<bool>,
-    /// By how much each hand is to withdraw from what it presses on, own frames, metres.
+    /// By how much each hand is to withdraw from what it presses on, arm frames, metres.
     withdraw: Option<Vec<DVec3>>,
     /// The arms that stay out of the other arm's way: their objects are at their goals, or they wait for their turn.
     parked: Vec<bool>,
@@ -112,80 +83,105 @@ struct LoopState {
     waypoints: Vec<Waypoint>,
 }
 
-impl TrialRunner {
+impl<'a, 'rig> ClosedLoop<'a, 'rig> {
+    /// Starts the closed loop of `runner` with the arms at `joint_angles` (radians), those of `start`.
+    pub(super) fn new(
+        runner: &'a TrialRunner,
+        rig: &'a mut TrialRig<'rig>,
+        start: &'a TrialStart,
+        joint_angles: &[Joints],
+        policy: &'a mut dyn ActionSource,
+    ) -> Self {
+        let state = LoopState::new(start, joint_angles);
+        Self { runner, rig, start, policy, state, n_steps: 0, n_shortened: 0, timed_out: false }
+    }
+
     /// Carries out one step. Returns whether the arms carried out the policy's whole action.
-    fn step(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-        policy: &mut dyn ActionSource,
-    ) -> Result<bool, FailureCause> {
-        let layout = self.config.layout;
-        let objects = rig.observe_objects()?;
+    fn step(&mut self) -> Result<bool, FailureCause> {
+        let (runner, state) = (self.runner, &mut self.state);
+        let layout = runner.config.layout;
+        let objects = self.rig.observe_objects()?;
         if state.before.is_some() {
-            state.count_success(self.is_success(rig, start));
+            state.count_success(runner.is_success(self.rig, self.start));
         }
-        let now: Vec<ArmObservation> = rig
+        let now: Vec<ArmObservation> = self
+            .rig
             .encoders()
             .iter()
             .zip(&objects)
             .enumerate()
             .map(|(arm, ((angles, opening), object))| {
                 let velocity = state.velocities[arm];
-                self.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
+                runner.mapping.observe(ArmIndex(arm), angles, *opening, velocity, object)
             })
             .collect();
-        let seen = self.held_as_in_training(&now, state);
+        let seen = runner.held_as_in_training(&now, state);
         let before = state.before.replace(seen.clone()).unwrap_or_else(|| seen.clone());
         let mut observation = vec![0.0; layout.n_observation()];
         let mut goal = vec![0.0; layout.n_goal()];
         for arm in layout.arms() {
             let numbers = &mut observation[layout.observation_of(arm)];
-            self.mapping.write_observation(&seen[arm.0], &before[arm.0], numbers);
-            goal[layout.goal_of(arm)].copy_from_slice(&start.goals[arm.0].as_vec3().to_array());
+            runner.mapping.write_observation(&seen[arm.0], &before[arm.0], numbers);
+            goal[layout.goal_of(arm)]
+                .copy_from_slice(&self.start.goals[arm.0].as_vec3().to_array());
         }
-        let meets = layout.arms().all(|arm| self.task.arm_meets_conditions(arm, &observation));
-        let at: Vec<DVec3> = now.iter().map(|now| now.object).collect();
-        let misplaced: Vec<bool> = self.misplaced(&objects, start).collect();
-        state.progress.see(&at, &misplaced);
-        state.count_done(&now, &start.goals, self.tolerance_m(), meets);
-        state.carries = self.task.shares_object()
-            && layout.arms().any(|arm| self.task.arm_holds(arm, &observation));
-        let blocks = self.observed_blocks(&objects, start.shared.as_ref());
-        if self.withdraw(rig, state, &blocks)? {
+        let meets = layout.arms().all(|arm| runner.task.arm_meets_conditions(arm, &observation));
+        let positions: Vec<DVec3> = now.iter().map(|now| now.object).collect();
+        let misplaced: Vec<bool> = runner.misplaced(&objects, self.start).collect();
+        state.progress.see(&positions, &misplaced);
+        state.count_done(&now, &self.start.goals, runner.tolerance_m(), meets);
+        state.carries = runner.task.shares_object()
+            && layout.arms().any(|arm| runner.task.arm_holds(arm, &observation));
+        let blocks = runner.observed_blocks(&objects, self.start.shared.as_ref());
+        if self.withdraw(&blocks)? {
             return Ok(false);
         }
+        let wanted = self.wanted_step(&now, [&observation, &goal], &blocks);
+        self.move_hands(&wanted)
+    }
+
+    /// Returns what the policy wants for `observation` and `goal`, with the changes that spare the objects and keep
+    /// parked arms where they are.
+    fn wanted_step<'b>(
+        &mut self,
+        now: &[ArmObservation],
+        [observation, goal]: [&[f32]; 2],
+        blocks: &'b [ObservedBlock],
+    ) -> WantedStep<'b> {
+        let (runner, state) = (self.runner, &mut self.state);
+        let layout = runner.config.layout;
         let mut action = vec![0.0; layout.n_action()];
-        policy.act(&observation, &goal, &mut action);
+        self.policy.act(observation, goal, &mut action);
         state.explore(&mut action);
-        let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks: &blocks };
+        let mut wanted = WantedStep { hands: Vec::new(), openings_m: Vec::new(), blocks };
         for arm in layout.arms() {
             let action = &action[layout.action_of(arm)];
             let commanded_m = state.openings_m[arm.0];
-            let opening_m = self.mapping.opening_after(commanded_m, now[arm.0].opening_m, action);
+            let opening_m = runner.mapping.opening_after(commanded_m, now[arm.0].opening_m, action);
             let velocity = &mut state.velocities[arm.0];
-            let (hand, then) = self.mapping.hand_after(now[arm.0].hand, *velocity, action);
+            let (hand, then) = runner.mapping.hand_after(now[arm.0].hand, *velocity, action);
             *velocity = then;
             wanted.hands.push(hand);
             wanted.openings_m.push(opening_m);
         }
-        self.spare_objects(state, &now, &start.goals, &mut wanted);
-        self.keep_parked(state, &mut wanted);
-        self.move_hands(rig, state, &wanted)
+        runner.spare_objects(state, now, &self.start.goals, &mut wanted);
+        runner.keep_parked(state, &mut wanted);
+        wanted
     }
+}
 
+impl TrialRunner {
     /// Returns the blocks at the observed poses; of a shared object, its parts by the poses of the arms' points.
     fn observed_blocks(
         &self,
         objects: &[ObjectPose],
         shared: Option<&SharedObject>,
     ) -> Vec<ObservedBlock> {
-        let yaw_rad = |object: &ObjectPose| object.turn.to_euler(EulerRot::ZYX).0;
+        let yaw_rad = |object: &ObjectPose| object.orientation.to_euler(EulerRot::ZYX).0;
         let Some(shared) = shared else {
             let half_m = DVec3::splat(self.config.block.half_m.into());
             let block = |object: &ObjectPose| ObservedBlock {
-                at: object.at_m,
+                position: object.at_m,
                 yaw_rad: yaw_rad(object),
                 half_m,
             };
@@ -201,229 +197,30 @@ impl TrialRunner {
             let arm = (0..objects.len()).min_by(nearer).unwrap_or(0);
             let object = &objects[arm];
             ObservedBlock {
-                at: object.at_m + object.turn * offset(arm),
+                position: object.at_m + object.orientation * offset(arm),
                 yaw_rad: yaw_rad(object),
                 half_m: double(part.half_extents_m),
             }
         };
         shared.shown.iter().map(block).collect()
     }
-
-    /// Moves the hands to the wanted positions, or as far as the check allows. Returns whether they arrived.
-    fn move_hands(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-        wanted: &WantedStep<'_>,
-    ) -> Result<bool, FailureCause> {
-        let from = self.hands(state);
-        for (attempt, parts) in ATTEMPTS.iter().enumerate() {
-            if state.carries && !is_joint(parts) {
-                continue;
-            }
-            let mut to: Vec<DVec3> = (0..from.len())
-                .map(|arm| match parts[arm] {
-                    StepPart::Share(share) => from[arm].lerp(wanted.hands[arm], share),
-                    StepPart::Back => from[arm] + BACK_M,
-                })
-                .collect();
-            if state.carries {
-                self.keep_hands_apart(&from, &mut to);
-            }
-            let makes_room = parts.iter().any(|part| matches!(part, StepPart::Back));
-            let check = if makes_room { &self.check } else { &self.step_check };
-            if self.attempt(rig, state, wanted, &to, check)? {
-                let is_whole = attempt == 0 && state.withdraw.is_none();
-                return Ok(is_whole && !state.progress.is_held_up());
-            }
-        }
-        if !state.carries {
-            for to in self.ways_apart(&from, state) {
-                if self.attempt(rig, state, wanted, &to, &self.check)? {
-                    break;
-                }
-            }
-        }
-        Ok(false)
-    }
-
-    /// Moves the hands `to` (own frames, metres) if `check` allows it. Returns whether it does, also if the hands are there.
-    fn attempt(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-        wanted: &WantedStep<'_>,
-        to: &[DVec3],
-        check: &CheckSettings,
-    ) -> Result<bool, FailureCause> {
-        let first = self.tools(state);
-        let measured = rig.encoders().into_iter().map(|(_, opening)| opening);
-        let Ok((step, held_up)) = self.step_waypoints(to, state, wanted, measured) else {
-            return Ok(false);
-        };
-        state.progress.hold_up(held_up);
-        if step.iter().all(|waypoint| is_still(&first, waypoint)) {
-            state.openings_m.clone_from(&wanted.openings_m);
-            return Ok(true);
-        }
-        let [rise, corner, end, last] = step;
-        let waypoints = [first.clone(), rise, corner, end, last];
-        let Ok(motion) = self.motion(&waypoints, &state.at, check) else { return Ok(false) };
-        let ends: Vec<Joints> =
-            motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-        let played = if state.carries {
-            rig.play(motion, self.config.speed).map(|()| true)
-        } else {
-            rig.play_yielding(motion, self.config.speed * self.step_speed(state, wanted, to))
-        };
-        let is_whole = match played {
-            Err(FailureCause::Refused(_)) => return Ok(false),
-            played => played?,
-        };
-        if is_whole {
-            state.at = ends;
-            state.openings_m.clone_from(&wanted.openings_m);
-            state.append_waypoints(waypoints);
-        } else {
-            self.yielded(rig, state, first);
-        }
-        Ok(true)
-    }
-
-    /// Returns the tools at the commanded angles, with the commanded openings.
-    fn tools(&self, state: &LoopState) -> Waypoint {
-        let openings = state.openings_m.iter().map(|opening_m| self.mapping.opening(*opening_m));
-        tool_positions(self.mapping.cell(), &state.at)
-            .iter()
-            .zip(openings)
-            .map(|(tool, opening)| ArmWaypoint {
-                tool_in_world_m: (*tool).into(),
-                gripper_opening: opening,
-            })
-            .collect()
-    }
-
-    /// The end effectors at the commanded angles, own frames, metres.
-    fn hands(&self, state: &LoopState) -> Vec<DVec3> {
-        let arms = state.at.iter().enumerate();
-        arms.map(|(arm, at)| self.mapping.hand_in_own(ArmIndex(arm), at)).collect()
-    }
-
-    /// Returns the positions of the hands (own frames, metres) in which two arms are farther apart than `from`, farthest
-    /// first.
-    fn ways_apart(&self, from: &[DVec3], state: &LoopState) -> Vec<Vec<DVec3>> {
-        let gap_m = |hands: &[DVec3]| {
-            let reached = hands.iter().zip(&state.at).enumerate().map(|(arm, (hand, near))| {
-                self.mapping.tool_in_world(ArmIndex(arm), *hand, near).map(|(_, angles)| angles)
-            });
-            let angles: Result<Vec<Joints>, ReachError> = reached.collect();
-            angles.map_or(f64::NEG_INFINITY, |angles| self.mapping.cell().gaps(&angles).arms_m)
-        };
-        let [first, second] = from else { return Vec::new() };
-        let now_m = gap_m(from);
-        let mut ways: Vec<(f64, Vec<DVec3>)> = Vec::new();
-        for one in APART_M {
-            for other in APART_M {
-                let to = vec![*first + one, *second + other];
-                let to_m = gap_m(&to);
-                if to_m > now_m {
-                    ways.push((to_m, to));
-                }
-            }
-        }
-        ways.sort_by(|(one_m, _), (other_m, _)| other_m.total_cmp(one_m));
-        ways.into_iter().map(|(_, to)| to).collect()
-    }
-
-    /// Returns the points between the pads of end effectors at `hands` (own frames, metres), world frame, metres.
-    fn pads_of(&self, hands: &[DVec3]) -> Vec<DVec3> {
-        let hands = hands.iter().enumerate();
-        hands.map(|(arm, own)| self.mapping.pads_in_world(ArmIndex(arm), *own)).collect()
-    }
-
-    /// Moves the end effectors `to` so that they are as far apart as `from`; own frames, metres.
-    fn keep_hands_apart(&self, from: &[DVec3], to: &mut [DVec3]) {
-        let mut pads = self.pads_of(to);
-        keep_distance(&self.pads_of(from), &mut pads);
-        for (arm, (to, pads)) in to.iter_mut().zip(pads).enumerate() {
-            *to = self.mapping.hand_of_pads(ArmIndex(arm), pads);
-        }
-    }
-
-    /// Returns the waypoints of the tools for end effectors that move `to` (own frames, metres): two corners, the end, and
-    /// the end again with closed grippers. A gripper that closed while it moves would drag its object along. `measured`
-    /// are the openings of the grippers, 0 to 1. Also returns whether a block keeps each hand from where it is to be.
-    fn step_waypoints(
-        &self,
-        to: &[DVec3],
-        state: &LoopState,
-        wanted: &WantedStep<'_>,
-        measured: impl Iterator<Item = f64>,
-    ) -> Result<([Waypoint; 4], Vec<bool>), FailureCause> {
-        let WantedStep { openings_m, blocks, .. } = wanted;
-        let from = self.hands(state);
-        let mut step: [Waypoint; 4] = Default::default();
-        let mut held_up = Vec::new();
-        let arms = self.mapping.cell().arms.iter().zip(measured).enumerate();
-        for (arm, (placed, measured)) in arms {
-            let (idx, near) = (ArmIndex(arm), &state.at[arm]);
-            let [before, opening] = [state.openings_m[arm], openings_m[arm]]
-                .map(|opening_m| self.mapping.opening(opening_m));
-            let [from, to] = [from[arm], to[arm]].map(|own| self.mapping.pads_in_world(idx, own));
-            let tool = |pads| {
-                let tool = self.mapping.tool_for_pads(idx, pads, near);
-                tool.map_err(|source| unreachable(idx, source))
-            };
-            let (_, then) = tool(to)?;
-            let pads = |centre, angles| Pads {
-                centre,
-                axes: tool_axes(placed, angles),
-                opening_m: before.max(opening).max(measured) * f64::from(MAX_OPENING_M),
-                commanded_m: before * f64::from(MAX_OPENING_M),
-            };
-            let pads_before = pads(from, near);
-            let way = if state.carries {
-                let end = lowered(&pads_before, to, blocks);
-                Way { points: [from, from.midpoint(end), end], is_held_up: false }
-            } else {
-                avoid_blocks(&pads_before, &pads(to, &then), blocks)
-            };
-            held_up.push(way.is_held_up);
-            let openings = if opening < before {
-                [before, before, before, opening]
-            } else {
-                [before, 0.5 * (before + opening), opening, opening]
-            };
-            let [rise, corner, end] = way.points;
-            for ((waypoint, point), opening) in
-                step.iter_mut().zip([rise, corner, end, end]).zip(openings)
-            {
-                let (tool_in_world_m, _) = tool(point)?;
-                waypoint.push(ArmWaypoint {
-                    tool_in_world_m: tool_in_world_m.into(),
-                    gripper_opening: opening,
-                });
-            }
-        }
-        Ok((step, held_up))
-    }
 }
 
 impl LoopState {
-    /// The state at the start of a trial, at joint angles `at`, radians.
-    fn new(start: &TrialStart, at: &[Joints]) -> Self {
+    /// The state at the start of a trial, at `joint_angles`, radians.
+    fn new(start: &TrialStart, joint_angles: &[Joints]) -> Self {
         Self {
-            at: at.to_vec(),
-            openings_m: vec![start.opening_m; at.len()],
-            velocities: vec![DVec3::ZERO; at.len()],
+            joint_angles: joint_angles.to_vec(),
+            openings_m: vec![start.opening_m; joint_angles.len()],
+            velocities: vec![DVec3::ZERO; joint_angles.len()],
             before: None,
             n_done: 0,
             n_in_success: 0,
             carries: false,
-            progress: Progress::new(at.len()),
-            narrow: vec![false; at.len()],
+            progress: Progress::new(joint_angles.len()),
+            narrow: vec![false; joint_angles.len()],
             withdraw: None,
-            parked: vec![false; at.len()],
+            parked: vec![false; joint_angles.len()],
             n_waits: 0,
             noise: None,
             waypoints: Vec::new(),
@@ -453,27 +250,4 @@ impl LoopState {
             && now.iter().zip(goals).all(|(now, goal)| (now.object - *goal).length() <= near_m);
         self.n_done = if done { self.n_done + 1 } else { 0 };
     }
-}
-
-/// Returns whether all arms carry out the same share of their displacements, so that they can carry an object together.
-fn is_joint(parts: &[StepPart]) -> bool {
-    let share = |part: &StepPart| match part {
-        StepPart::Share(share) => Some(*share),
-        StepPart::Back => None,
-    };
-    let first = parts.first().and_then(share);
-    first.is_some() && parts.iter().all(|part| share(part) == first)
-}
-
-/// Returns the axes of an arm's tool as columns, world frame: its fingers close along the first and point along the third.
-fn tool_axes(placed: &PlacedArm, angles: &Joints) -> DMat3 {
-    let tool = placed.world_from_base() * ForwardKinematics::new(placed.model, angles).tool();
-    DMat3::from_quat(tool.rotation.into())
-}
-
-fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
-    from.iter().zip(to).all(|(from, to)| {
-        (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_M
-            && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING
-    })
 }

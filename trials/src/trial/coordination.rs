@@ -10,18 +10,18 @@ use tandem_kinematics::{Joints, Waypoint, WorkCell};
 /// Points between two pairs of waypoints at which the gap is computed.
 const N_BETWEEN: usize = 3;
 
-/// Returns `waypoints` with waiting arms, so that the arms are at least `gap_m` metres apart, or `None` if there are not two
-/// arms, or no such motion. `at` has joint angles near the first waypoint, radians.
+/// Returns `waypoints` with waiting arms, so that the arms are at least `gap_m` metres apart, or `None` if there are
+/// not two arms, or no such motion. `joint_angles` are near the first waypoint, radians.
 pub(crate) fn coordinated(
     cell: &WorkCell,
     waypoints: &[Waypoint],
-    at: &[Joints],
+    joint_angles: &[Joints],
     gap_m: f64,
 ) -> Option<Vec<Waypoint>> {
     if cell.arms.len() != 2 || waypoints.is_empty() {
         return None;
     }
-    let path = |arm| joint_path(cell, waypoints, ArmIndex(arm), at[arm]);
+    let path = |arm| joint_path(cell, waypoints, ArmIndex(arm), joint_angles[arm]);
     let paths = [path(0)?, path(1)?];
     let is_free = |from: [usize; 2], to: [usize; 2]| {
         (1..=N_BETWEEN).all(|part| {
@@ -56,9 +56,9 @@ fn joint_path(
     angles.collect()
 }
 
-/// Returns the shortest sequence of pairs of positions from the first pair to the last one, on two paths of `n` positions
-/// each. Each pair follows the one before by a step of one arm or of both, from one pair to another, that `is_free`
-/// allows.
+/// Returns the shortest sequence of pairs of positions from the first pair to the last one, on two paths of `n`
+/// positions each. Each pair follows the one before by a step of one arm or of both, from one pair to another, that
+/// `is_free` allows.
 fn shortest(n: usize, is_free: impl Fn([usize; 2], [usize; 2]) -> bool) -> Option<Vec<[usize; 2]>> {
     // Together first, so that arms wait only where they have to.
     const STEPS: [[usize; 2]; 3] = [[1, 1], [1, 0], [0, 1]];
@@ -85,15 +85,15 @@ fn shortest(n: usize, is_free: impl Fn([usize; 2], [usize; 2]) -> bool) -> Optio
             }
         }
     }
-    let mut at = [n - 1; 2];
-    if steps_to[cell(at)] == usize::MAX {
+    let mut position = [n - 1; 2];
+    if steps_to[cell(position)] == usize::MAX {
         return None;
     }
-    let mut order = vec![at];
-    while at != [0, 0] {
-        let step = came_by[cell(at)];
-        at = [at[0] - step[0], at[1] - step[1]];
-        order.push(at);
+    let mut order = vec![position];
+    while position != [0, 0] {
+        let step = came_by[cell(position)];
+        position = [position[0] - step[0], position[1] - step[1]];
+        order.push(position);
     }
     order.reverse();
     Some(order)

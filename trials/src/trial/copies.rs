@@ -1,25 +1,26 @@
 //! Copies of the pair, on which motions without feedback are rehearsed and tried.
 //!
-//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. Such
-//! a motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair. Their
-//! noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
+//! The training world has a free hand; on the arms the gripper tilts with the joints and has two narrow fingers. Such a
+//! motion is therefore executed on copies of the pair before one is chosen. None of them has the friction of the pair.
+//! Their noise and latencies are as large as the pair's, but have other seeds. The policy rehearses without noise.
 
 use tandem_kinematics::Joints;
 
 use crate::simulated::{CameraConfig, GripperConfig, SimulatedConfig, SimulatedPair};
+use crate::trial::closed_loop::ClosedLoop;
 use crate::trial::open_loop::PlannedMotion;
 use crate::trial::outcome::{FailureCause, ObjectResult};
 use crate::trial::rehearsal::TrialStart;
 use crate::trial::rig::{Goals, TrialRig};
-use crate::trial::robustness::USED_TOLERANCE;
+use crate::trial::robustness::USED_TOLERANCE_SHARE;
 use crate::trial::runner::TrialRunner;
 use crate::trial::{ActionSource, NoObserver, TrialError};
 
 /// The friction of each copy, as a share of the pair's.
 pub(super) const FRICTIONS: [f32; 8] = [0.8, 1.2, 0.9, 1.1, 0.85, 1.15, 0.95, 1.05];
-/// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial has
-/// such a number.
-const FIRST_NOISE: u64 = 1 << 48;
+/// The noise on copy N of a trial, counted from 1, is that of a trial whose number is larger by N times this. No trial
+/// has such a number.
+const NOISE_STRIDE: u64 = 1 << 48;
 
 impl TrialRunner {
     /// Executes a planned motion blindly on the copies of the pair. Returns the number of those on which it fails, or
@@ -27,15 +28,15 @@ impl TrialRunner {
     pub(super) fn n_failed_copies(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         planned: &PlannedMotion,
         max_failed: usize,
     ) -> Result<Option<usize>, TrialError> {
         let mut n_failed = 0;
-        let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * FIRST_NOISE));
+        let noises = (1..).map(|copy: u64| start.number.wrapping_add(copy * NOISE_STRIDE));
         for (friction, noise) in FRICTIONS.into_iter().zip(noises) {
             let simulated = with_friction(&self.config.simulated, friction);
-            let pair = self.pair(start, at, noise, &simulated);
+            let pair = self.pair(start, joint_angles, noise, &simulated);
             n_failed += usize::from(!self.succeeds_on(pair, start, planned)?);
             if n_failed > max_failed {
                 return Ok(None);
@@ -55,28 +56,28 @@ impl TrialRunner {
             let execution = self.open_loop(rig, start, planned.clone());
             self.report(start.number, start, &initial, rig, execution)
         })?;
-        let near_m = USED_TOLERANCE * self.tolerance_m();
+        let near_m = USED_TOLERANCE_SHARE * self.tolerance_m();
         let is_near = |object: &ObjectResult| object.end.distance(object.goal) <= near_m;
         Ok(report.cause.is_none() && report.objects.iter().all(is_near))
     }
 
-    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction and without
-    /// noise.
+    /// Plans the motion of an episode in the closed loop on a copy of the pair with `friction` times its friction and
+    /// without noise.
     pub(super) fn rehearse_on_copy(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         friction: f32,
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
         let simulated = without_noise(&with_friction(&self.config.simulated, friction));
-        let pair = self.pair(start, at, start.number, &simulated);
+        let pair = self.pair(start, joint_angles, start.number, &simulated);
         let (execution, ends) = self.on(pair, |rig| {
-            let execution = self.closed_loop(rig, start, at, policy);
+            let execution = ClosedLoop::new(self, rig, start, joint_angles, policy).run();
             (execution, rig.pair().objects())
         })?;
         let (waypoints, motion) = match execution.ended {
-            Ok(()) => self.blind_motion(execution.waypoints, at),
+            Ok(()) => self.blind_motion(execution.waypoints, joint_angles),
             Err(cause) => (Vec::new(), Err(FailureCause::NotRehearsed(Box::new(cause)))),
         };
         Ok(PlannedMotion {
@@ -118,7 +119,11 @@ fn without_noise(simulated: &SimulatedConfig) -> SimulatedConfig {
         angle_noise_rad: 0.0,
         rate_noise_radps: 0.0,
         torque_noise_nm: 0.0,
-        camera: CameraConfig { place_noise_m: 0.0, turn_noise_rad: 0.0, ..simulated.camera },
+        camera: CameraConfig {
+            position_noise_m: 0.0,
+            orientation_noise_rad: 0.0,
+            ..simulated.camera
+        },
         ..simulated.clone()
     }
 }
@@ -141,11 +146,12 @@ mod tests {
         let tools = |hands: &[DVec3]| runner.waypoint(hands, &[0.0; 2], &near).unwrap();
         let raised: Vec<DVec3> = start.hands.iter().map(|hand| *hand + DVec3::Z * 0.02).collect();
         let waypoints = vec![tools(&start.hands), tools(&raised)];
-        let at = start_angles(&runner.mapping, &start).unwrap();
-        let (waypoints, motion) = runner.blind_motion(waypoints, &at);
+        let joint_angles = start_angles(&runner.mapping, &start).unwrap();
+        let (waypoints, motion) = runner.blind_motion(waypoints, &joint_angles);
         let idle = PlannedMotion { waypoints, motion, rehearsed_m: vec![0.0; 2], n_steps: 1 };
-        let n_failed =
-            |start, max_failed| runner.n_failed_copies(start, &at, &idle, max_failed).unwrap();
+        let n_failed = |start, max_failed| {
+            runner.n_failed_copies(start, &joint_angles, &idle, max_failed).unwrap()
+        };
         assert_eq!(n_failed(&start, usize::MAX), Some(FRICTIONS.len()));
         assert_eq!(n_failed(&start, 1), None);
         let solved = TrialStart { goals: start.objects.clone(), ..start.clone() };

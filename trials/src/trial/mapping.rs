@@ -27,9 +27,9 @@ pub const PADS_LOWEST_M: f64 = 0.031;
 pub const TABLE_GAP_M: f64 = 0.006;
 /// Half the edge of the training world's blocks unless their sizes vary, metres.
 pub const TRAINED_HALF_M: f64 = 0.0225;
-/// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above the
-/// table, metres.
-const WITHDRAWN_M: [f64; 2] = [-0.05, 0.20];
+/// Where a hand is out of the way: x (from the middle of the arm's area away from its base, metres) and height above
+/// the table, metres.
+const WITHDRAWN_POSITION_M: [f64; 2] = [-0.05, 0.20];
 /// The number of iterations that determine the tool's position for a point between the pads.
 const TILT_ROUNDS: usize = 4;
 
@@ -54,16 +54,16 @@ pub struct Mapping {
 /// One arm and its object at one time, in the policy's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmObservation {
-    /// The end effector, own frame, metres.
+    /// The end effector, arm frame, metres.
     pub hand: DVec3,
-    /// The velocity of the training world's end effector, own frame, metres per second.
+    /// The velocity of the training world's end effector, arm frame, metres per second.
     pub hand_velocity: DVec3,
     /// The opening of each side of the policy's gripper, metres; 0 in tasks without grasping.
     pub opening_m: f64,
-    /// The object, own frame, metres.
+    /// The object, arm frame, metres.
     pub object: DVec3,
-    /// The orientation of the object, own frame.
-    pub turn: DQuat,
+    /// The orientation of the object, arm frame.
+    pub orientation: DQuat,
 }
 
 impl Mapping {
@@ -93,21 +93,21 @@ impl Mapping {
         &self.cell
     }
 
-    /// Converts the position of an object or goal from the own frame of `arm` to the world frame, metres.
+    /// Converts the position of an object or goal from the frame of `arm` to the world frame, metres.
     #[must_use]
-    pub fn object_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        let own = own + DVec3::Z * (self.block_half_m - self.trained_half_m);
-        self.cell.world_from_own(arm, &own.into()).into()
+    pub fn object_in_world(&self, arm: ArmIndex, in_arm: DVec3) -> DVec3 {
+        let lifted = in_arm + DVec3::Z * (self.block_half_m - self.trained_half_m);
+        self.cell.world_from_arm(arm, &lifted.into()).into()
     }
 
-    /// Converts the position of an object or goal from the world frame to the own frame of `arm`, metres.
+    /// Converts the position of an object or goal from the world frame to the frame of `arm`, metres.
     #[must_use]
-    pub fn object_in_own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        self.own(arm, in_world) - DVec3::Z * (self.block_half_m - self.trained_half_m)
+    pub fn object_in_arm(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
+        self.in_arm(arm, in_world) - DVec3::Z * (self.block_half_m - self.trained_half_m)
     }
 
-    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `own` (own frame, metres), and
-    /// the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
+    /// Returns the tool's origin (world frame, metres) for the policy's end effector at `in_arm` (arm frame, metres),
+    /// and the joint angles near `near` that reach it, radians. Hands that would come nearer to the table than
     /// [`TABLE_GAP_M`] are raised.
     ///
     /// # Errors
@@ -115,23 +115,23 @@ impl Mapping {
     pub fn tool_in_world(
         &self,
         arm: ArmIndex,
-        own: DVec3,
+        in_arm: DVec3,
         near: &Joints,
     ) -> Result<(DVec3, Joints), ReachError> {
-        self.tool_for_pads(arm, self.pads_in_world(arm, own), near)
+        self.tool_for_pads(arm, self.pads_in_world(arm, in_arm), near)
     }
 
-    /// Converts a point between the pads from the world frame to the policy's end effector in the own frame of `arm`,
+    /// Converts a point between the pads from the world frame to the policy's end effector in the frame of `arm`,
     /// metres: the inverse of [`pads_in_world`](Self::pads_in_world).
     #[must_use]
     pub fn hand_of_pads(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
-        self.own(arm, in_world) - DVec3::Z * self.hand_lift_m
+        self.in_arm(arm, in_world) - DVec3::Z * self.hand_lift_m
     }
 
-    /// Converts an end effector at `own` (own frame of `arm`) to the point between the pads, world frame, metres.
+    /// Converts an end effector at `in_arm` (frame of `arm`) to the point between the pads, world frame, metres.
     #[must_use]
-    pub fn pads_in_world(&self, arm: ArmIndex, own: DVec3) -> DVec3 {
-        self.cell.world_from_own(arm, &(own + DVec3::Z * self.hand_lift_m).into()).into()
+    pub fn pads_in_world(&self, arm: ArmIndex, in_arm: DVec3) -> DVec3 {
+        self.cell.world_from_arm(arm, &(in_arm + DVec3::Z * self.hand_lift_m).into()).into()
     }
 
     /// As [`tool_in_world`](Self::tool_in_world), for a point between the pads in the world frame, metres.
@@ -156,9 +156,9 @@ impl Mapping {
         Ok((tool, angles))
     }
 
-    /// Returns the policy's end effector for joint angles `angles` (radians) of `arm`, own frame, metres.
+    /// Returns the policy's end effector for joint angles `angles` (radians) of `arm`, arm frame, metres.
     #[must_use]
-    pub fn hand_in_own(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
+    pub fn hand_in_arm(&self, arm: ArmIndex, angles: &Joints) -> DVec3 {
         let placed = &self.cell.arms[arm.0];
         let posture = tandem_kinematics::ForwardKinematics::new(placed.model, angles);
         let tool = DVec3::from(placed.world_from_base() * posture.tool_m());
@@ -181,7 +181,7 @@ impl Mapping {
 
     /// Returns the policy's opening (metres on each side) for the real gripper's `opening`, 0 to 1.
     #[must_use]
-    pub fn opening_in_own(&self, opening: f64) -> f64 {
+    pub fn policy_opening_m(&self, opening: f64) -> f64 {
         let touching = self.block_half_m / f64::from(MAX_OPENING_M);
         if opening < touching {
             (self.trained_half_m * opening / touching).max(0.0)
@@ -193,7 +193,7 @@ impl Mapping {
     }
 
     /// Converts measurements of `arm` and its object to the policy's terms: joint angles `angles` (radians), the real
-    /// gripper's `opening` (0 to 1), the velocity of the training world's hand (own frame, metres per second) and the
+    /// gripper's `opening` (0 to 1), the velocity of the training world's hand (arm frame, metres per second) and the
     /// object as seen (world frame).
     #[must_use]
     pub fn observe(
@@ -205,17 +205,18 @@ impl Mapping {
         seen: &ObjectPose,
     ) -> ArmObservation {
         let upright = DQuat::from_rotation_z(-self.cell.arms[arm.0].yaw_rad);
-        let opening_m = if self.layout.task.grasps() { self.opening_in_own(opening) } else { 0.0 };
+        let opening_m =
+            if self.layout.task.grasps() { self.policy_opening_m(opening) } else { 0.0 };
         ArmObservation {
-            hand: self.hand_in_own(arm, angles),
+            hand: self.hand_in_arm(arm, angles),
             hand_velocity,
             opening_m,
-            object: self.object_in_own(arm, seen.at_m),
-            turn: upright * seen.turn * upright.inverse(),
+            object: self.object_in_arm(arm, seen.at_m),
+            orientation: upright * seen.orientation * upright.inverse(),
         }
     }
 
-    /// Returns the nearest position to `hand` that the training world's hand may have; own frame, metres.
+    /// Returns the nearest position to `hand` that the training world's hand may have; arm frame, metres.
     #[must_use]
     pub fn reachable_hand(&self, hand: DVec3) -> DVec3 {
         self.hand.reachable(hand)
@@ -228,14 +229,18 @@ impl Mapping {
     }
 
     /// Returns the position to which a hand at `hand` withdraws to make room for other arms: near its base and above
-    /// the objects on the table; own frame, metres.
+    /// the objects on the table; arm frame, metres.
     #[must_use]
     pub fn withdrawn_hand(&self, hand: DVec3) -> DVec3 {
-        self.hand.reachable(DVec3::new(WITHDRAWN_M[0], 0.5 * hand.y, WITHDRAWN_M[1]))
+        self.hand.reachable(DVec3::new(
+            WITHDRAWN_POSITION_M[0],
+            0.5 * hand.y,
+            WITHDRAWN_POSITION_M[1],
+        ))
     }
 
     /// Returns the position and velocity of the training world's hand after a step with `action` (one arm's, shape
-    /// `[action_per_arm]`, in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    /// `[action_per_arm]`, in [−1, 1]) from `hand` with `velocity`; arm frame, metres and metres per second.
     #[must_use]
     pub fn hand_after(&self, hand: DVec3, velocity: DVec3, action: &[f32]) -> (DVec3, DVec3) {
         self.hand.after(hand, velocity, action)
@@ -266,10 +271,10 @@ impl Mapping {
         write_observation(&self.hand, now, before, observation);
     }
 
-    fn own(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
+    fn in_arm(&self, arm: ArmIndex, in_world: DVec3) -> DVec3 {
         let in_base =
             self.cell.arms[arm.0].world_from_base().inverse_transform_point(&in_world.into());
-        self.cell.task_frame.own_from_base(&in_base).into()
+        self.cell.task_frame.arm_from_base(&in_base).into()
     }
 }
 
@@ -282,33 +287,35 @@ fn write_observation(
 ) {
     let hand_velocity = now.hand_velocity * hand.control_step_s();
     let end_velocity_share = hand.end_velocity_share();
-    let (hand_way, object_way) = (now.hand - before.hand, now.object - before.object);
-    let together = object_way.dot(hand_way) / hand_way.length_squared().max(1e-6);
+    let (hand_displacement, object_displacement) =
+        (now.hand - before.hand, now.object - before.object);
+    let together =
+        object_displacement.dot(hand_displacement) / hand_displacement.length_squared().max(1e-6);
     let together = together.clamp(0.0, 1.0);
-    let object_velocity =
-        hand_velocity * together + (object_way - hand_way * together) * end_velocity_share;
-    let turn = (now.turn * before.turn.inverse()).normalize();
-    let turn = if turn.w < 0.0 { -turn } else { turn };
-    let turn_velocity = turn.to_scaled_axis() * end_velocity_share;
+    let object_velocity = hand_velocity * together
+        + (object_displacement - hand_displacement * together) * end_velocity_share;
+    let rotation = (now.orientation * before.orientation.inverse()).normalize();
+    let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+    let angular_velocity = rotation.to_scaled_axis() * end_velocity_share;
     let opening_rate_m = now.opening_m - before.opening_m;
-    let facing = if now.turn.w < 0.0 { -now.turn } else { now.turn };
+    let orientation = if now.orientation.w < 0.0 { -now.orientation } else { now.orientation };
     let parts = [
         now.hand,
         now.object,
         now.object - now.hand,
         DVec3::splat(now.opening_m),
-        DVec3::new(facing.x, facing.y, facing.z),
+        DVec3::new(orientation.x, orientation.y, orientation.z),
     ];
     let rates = [
         object_velocity - hand_velocity,
-        turn_velocity,
+        angular_velocity,
         hand_velocity,
         DVec3::splat(opening_rate_m),
     ];
     for (idx, part) in parts.iter().enumerate() {
         observation[3 * idx..3 * idx + 3].copy_from_slice(&part.as_vec3().to_array());
     }
-    observation[15] = facing.as_quat().w;
+    observation[15] = orientation.as_quat().w;
     for (idx, part) in rates.iter().enumerate() {
         observation[16 + 3 * idx..19 + 3 * idx].copy_from_slice(&part.as_vec3().to_array());
     }

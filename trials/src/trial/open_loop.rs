@@ -16,11 +16,11 @@ use crate::trial::{ActionSource, TrialError};
 
 /// Steps of a hand that withdraws: two of them up, by [`LIFT_M`], and the others away.
 const N_WITHDRAWAL_STEPS: usize = 10;
-/// A rehearsal is tried on the copies of the pair if it fails in at most this many more variants of the training world than
-/// the best one.
+/// A rehearsal is tried on the copies of the pair if it fails in at most this many more variants of the training world
+/// than the best one.
 const VARIANTS_MARGIN: usize = 2;
-/// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of the
-/// training world.
+/// No further rehearsal is needed if one succeeds on all copies of the pair and fails in at most this many variants of
+/// the training world.
 const ENOUGH_VARIANTS: usize = 1;
 /// The number of failed variants of a rehearsal that was not in the training world.
 const UNTRIED: usize = usize::MAX;
@@ -49,17 +49,18 @@ struct Candidate {
 }
 
 impl TrialRunner {
-    /// Plans the most robust of several rehearsals: the one that fails on the fewest copies of the pair. If none of those in
-    /// the training world succeeds on all copies, the policy also plays, with noise, in the closed loop on copies.
+    /// Plans the most robust of several rehearsals: the one that fails on the fewest copies of the pair. If none of
+    /// those in the training world succeeds on all copies, the policy also plays, with noise, in the closed loop on
+    /// copies.
     pub(super) fn rehearse(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         policy: &mut dyn ActionSource,
     ) -> Result<PlannedMotion, TrialError> {
         let rollout = self.rehearsal.play(policy)?;
         let Some(variants) = self.rehearsal.variants() else {
-            return Ok(self.planned(&rollout, start, at));
+            return Ok(self.planned(&rollout, start, joint_angles));
         };
         let mut noise = episode_rng(self.config.seed, start.number, Stream::Exploration);
         let mut noisy = |observation: &[f32], goal: &[f32], action: &mut [f32]| {
@@ -67,27 +68,29 @@ impl TrialRunner {
             add_noise(&mut noise, action);
         };
         let mut best =
-            self.rehearse_in_training_world(start, at, &rollout, variants, &mut noisy)?;
+            self.rehearse_in_training_world(start, joint_angles, &rollout, variants, &mut noisy)?;
         for friction in FRICTIONS.into_iter().cycle().take(self.config.n_rehearsals as usize) {
             let Some(max_failed) = max_failed_copies(best.as_ref(), UNTRIED) else { break };
-            let planned = self.rehearse_on_copy(start, at, friction, &mut noisy)?;
+            let planned = self.rehearse_on_copy(start, joint_angles, friction, &mut noisy)?;
             if planned.motion.is_err() {
                 continue;
             }
-            if let Some(n_failed_copies) = self.n_failed_copies(start, at, &planned, max_failed)? {
+            if let Some(n_failed_copies) =
+                self.n_failed_copies(start, joint_angles, &planned, max_failed)?
+            {
                 best = Some(Candidate { n_failed_copies, n_failed_variants: UNTRIED, planned });
             }
         }
-        Ok(best.map_or_else(|| self.planned(&rollout, start, at), |best| best.planned))
+        Ok(best.map_or_else(|| self.planned(&rollout, start, joint_angles), |best| best.planned))
     }
 
-    /// Returns the most robust of the configured number of episodes in the training world: the one that fails on the fewest
-    /// copies of the pair and, of those, in the fewest variants of the training world. The actions of all but the first
-    /// episode, `first`, have noise. Returns `None` if the check refuses all motions.
+    /// Returns the most robust of the configured number of episodes in the training world: the one that fails on the
+    /// fewest copies of the pair and, of those, in the fewest variants of the training world. The actions of all but
+    /// the first episode, `first`, have noise. Returns `None` if the check refuses all motions.
     fn rehearse_in_training_world(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         first: &Rollout,
         variants: &Variants,
         noisy: &mut dyn ActionSource,
@@ -107,11 +110,12 @@ impl TrialRunner {
             let Some(max_failed) = max_failed_copies(best.as_ref(), n_failed_variants) else {
                 continue;
             };
-            let planned = self.planned(&rollout, start, at);
+            let planned = self.planned(&rollout, start, joint_angles);
             if planned.motion.is_err() {
                 continue;
             }
-            let n_failed_copies = self.n_failed_copies(start, at, &planned, max_failed)?;
+            let n_failed_copies =
+                self.n_failed_copies(start, joint_angles, &planned, max_failed)?;
             let Some(n_failed_copies) = n_failed_copies else { continue };
             best = Some(Candidate { n_failed_copies, n_failed_variants, planned });
             if n_failed_copies == 0 && n_failed_variants <= ENOUGH_VARIANTS {
@@ -122,9 +126,14 @@ impl TrialRunner {
     }
 
     /// Converts an episode in the training world to a motion.
-    fn planned(&self, rollout: &Rollout, start: &TrialStart, at: &[Joints]) -> PlannedMotion {
+    fn planned(
+        &self,
+        rollout: &Rollout,
+        start: &TrialStart,
+        joint_angles: &[Joints],
+    ) -> PlannedMotion {
         let mut openings = vec![start.opening_m; start.hands.len()];
-        let mut waypoints = vec![self.waypoint(&start.hands, &openings, at)];
+        let mut waypoints = vec![self.waypoint(&start.hands, &openings, joint_angles)];
         for step in &rollout.steps {
             for (arm, opening_m) in openings.iter_mut().enumerate() {
                 let action = &step.action[self.config.layout.action_of(ArmIndex(arm))];
@@ -132,10 +141,10 @@ impl TrialRunner {
             }
             let hands: Vec<DVec3> =
                 step.hands.iter().map(|hand| self.mapping.reachable_hand(*hand)).collect();
-            waypoints.push(self.waypoint(&hands, &openings, at));
+            waypoints.push(self.waypoint(&hands, &openings, joint_angles));
         }
         let (waypoints, motion) = match waypoints.into_iter().collect() {
-            Ok(waypoints) => self.blind_motion(waypoints, at),
+            Ok(waypoints) => self.blind_motion(waypoints, joint_angles),
             Err(cause) => (Vec::new(), Err(cause)),
         };
         PlannedMotion {
@@ -175,14 +184,14 @@ impl TrialRunner {
         }
     }
 
-    /// Plans and checks the motion through `waypoints` from joint angles `at` (radians). If that brings the arms too close, one
-    /// waits for the other, unless both hold one object. Returns the waypoints of the motion as well.
+    /// Plans and checks the motion through `waypoints` from `joint_angles` (radians). If that brings the arms too
+    /// close, one waits for the other, unless both hold one object. Returns the waypoints of the motion as well.
     pub(super) fn blind_motion(
         &self,
         waypoints: Vec<Waypoint>,
-        at: &[Joints],
+        joint_angles: &[Joints],
     ) -> (Vec<Waypoint>, Result<Motion, FailureCause>) {
-        let motion = self.motion(&waypoints, at, &self.check);
+        let motion = self.motion(&waypoints, joint_angles, &self.check);
         let Err(FailureCause::Refused(MotionRefusal::Check(Refusal {
             reason: Reason::ArmsGap(..),
             ..
@@ -193,11 +202,12 @@ impl TrialRunner {
         if self.task.shares_object() {
             return (waypoints, motion);
         }
-        for path in [waypoints.clone(), self.with_withdrawals(&waypoints, at)] {
-            let Some(waypoints) = coordinated(self.mapping.cell(), &path, at, STEP_GAP_M) else {
+        for path in [waypoints.clone(), self.with_withdrawals(&waypoints, joint_angles)] {
+            let Some(waypoints) = coordinated(self.mapping.cell(), &path, joint_angles, STEP_GAP_M)
+            else {
                 continue;
             };
-            let motion = self.motion(&waypoints, at, &self.check);
+            let motion = self.motion(&waypoints, joint_angles, &self.check);
             if motion.is_ok() {
                 return (waypoints, motion);
             }
@@ -205,34 +215,34 @@ impl TrialRunner {
         (waypoints, motion)
     }
 
-    /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before it
-    /// starts and, where it holds nothing, withdraws at the end.
-    fn with_withdrawals(&self, waypoints: &[Waypoint], at: &[Joints]) -> Vec<Waypoint> {
+    /// Returns `waypoints` with room for one arm to pass while the other waits: each hand withdraws and returns before
+    /// it starts and, in tasks without grasping, withdraws at the end.
+    fn with_withdrawals(&self, waypoints: &[Waypoint], joint_angles: &[Joints]) -> Vec<Waypoint> {
         let (Some(first), Some(last)) = (waypoints.first(), waypoints.last()) else {
             return waypoints.to_vec();
         };
-        let away = self.withdrawal(first, at);
+        let away = self.withdrawal(first, joint_angles);
         let back = away.iter().rev().skip(1).cloned().chain([first.clone()]);
         let mut path = vec![first.clone()];
         path.extend(away.iter().cloned().chain(back));
         path.extend(waypoints[1..].iter().cloned());
         if !self.config.layout.task.grasps() {
-            path.extend(self.withdrawal(last, at));
+            path.extend(self.withdrawal(last, joint_angles));
         }
         path
     }
 
-    /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far as
-    /// the arms reach.
-    fn withdrawal(&self, from: &Waypoint, at: &[Joints]) -> Vec<Waypoint> {
-        let way = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
+    /// Returns the waypoints after `from` in which all hands go up, and then to where they are out of the way, as far
+    /// as the arms reach.
+    fn withdrawal(&self, from: &Waypoint, joint_angles: &[Joints]) -> Vec<Waypoint> {
+        let path = |arm: usize, waypoint: &ArmWaypoint| -> Vec<ArmWaypoint> {
             let index = ArmIndex(arm);
             let placed = &self.mapping.cell().arms[arm];
             let target = placed.target(&waypoint.tool_in_world_m);
-            let Ok(solution) = placed.model.inverse_kinematics(&target, &at[arm]) else {
+            let Ok(solution) = placed.model.inverse_kinematics(&target, &joint_angles[arm]) else {
                 return vec![*waypoint; N_WITHDRAWAL_STEPS];
             };
-            let hand = self.mapping.hand_in_own(index, &solution.angles);
+            let hand = self.mapping.hand_in_arm(index, &solution.angles);
             let above = self.mapping.reachable_hand(hand + DVec3::Z * LIFT_M);
             let target = self.mapping.withdrawn_hand(hand);
             let mut last = *waypoint;
@@ -249,14 +259,14 @@ impl TrialRunner {
             };
             (0..N_WITHDRAWAL_STEPS).map(step).collect()
         };
-        let ways: Vec<Vec<ArmWaypoint>> =
-            from.iter().enumerate().map(|(arm, waypoint)| way(arm, waypoint)).collect();
-        (0..N_WITHDRAWAL_STEPS).map(|step| ways.iter().map(|way| way[step]).collect()).collect()
+        let paths: Vec<Vec<ArmWaypoint>> =
+            from.iter().enumerate().map(|(arm, waypoint)| path(arm, waypoint)).collect();
+        (0..N_WITHDRAWAL_STEPS).map(|step| paths.iter().map(|path| path[step]).collect()).collect()
     }
 }
 
-/// Returns the largest number of copies on which a motion may fail that is to be preferred to `best`, or `None` if there
-/// is no such number.
+/// Returns the largest number of copies on which a motion may fail that is to be preferred to `best`, or `None` if
+/// there is no such number.
 fn max_failed_copies(best: Option<&Candidate>, n_failed_variants: usize) -> Option<usize> {
     match best {
         None => Some(usize::MAX),
@@ -308,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn arms_whose_ways_end_in_each_other_withdraw() {
+    fn arms_whose_paths_end_in_each_other_withdraw() {
         let runner = runner(Task::SharedPush);
         let cell = runner.mapping.cell();
         let near = cell.ready(0.2).unwrap();

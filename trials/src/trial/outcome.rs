@@ -7,9 +7,9 @@ use tandem_kinematics::{PlanError, Refusal};
 use tandem_bridge::executor::{StartError, Stop};
 
 /// An object that rises by more than this was lifted, metres.
-const LIFTED_M: f64 = 0.03;
-/// An object farther than this from the origin of its arm's own frame, along x or y, is out of reach, metres. In the
-/// shared world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
+const LIFT_THRESHOLD_M: f64 = 0.03;
+/// An object farther than this from the origin of its arm's frame, along x or y, is out of reach, metres. In the shared
+/// world the origin is not the workspace's centre, and an object between workspace and base counts as within reach.
 const REACH_M: f64 = 0.27;
 
 /// The cause of a failed trial.
@@ -105,7 +105,7 @@ impl FailureCause {
     }
 }
 
-/// The result of one object; own frame of its arm, metres.
+/// The result of one object; frame of its arm, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ObjectResult {
     /// The initial position.
@@ -126,8 +126,8 @@ impl ObjectResult {
     }
 
     fn lost(&self, task: Task) -> bool {
-        let fell = self.highest_m - self.start.z > LIFTED_M
-            && self.end.z - self.start.z < 0.5 * LIFTED_M
+        let fell = self.highest_m - self.start.z > LIFT_THRESHOLD_M
+            && self.end.z - self.start.z < 0.5 * LIFT_THRESHOLD_M
             && task.grasps();
         let away = self.end.x.abs().max(self.end.y.abs()) > REACH_M;
         fell || away || self.end.z < 0.0
@@ -145,8 +145,8 @@ pub(crate) fn contact_failure(touched: Contacts) -> Option<FailureCause> {
     }
 }
 
-/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success. An object has reached
-/// its goal up to a distance of `tolerance_m`.
+/// Returns the failure of a trial that was carried out to its end or timed out; `None` is success. An object has
+/// reached its goal up to a distance of `tolerance_m`.
 pub(crate) fn object_failure(
     task: Task,
     objects: &[ObjectResult],

@@ -10,12 +10,12 @@ use crate::trial::shared_object::shared_object;
 use crate::trial::training_hand::TrainingHand;
 use crate::trial::{ActionSource, TrialError};
 
-/// The smallest gap between two blocks, and between a block and the goal of another one, metres.
+/// The smallest gap between two blocks at the start, and between two blocks at their goals, metres.
 const ROOM_M: f64 = 0.02;
 /// The largest number of starts that are drawn until one has room for the blocks.
 const N_DRAWS: usize = 1000;
 
-/// The start and goals of a trial; own frames, metres.
+/// The start and goals of a trial; arm frames, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrialStart {
     /// The number of the trial.
@@ -41,7 +41,7 @@ const FIRST_OPENING: usize = 9;
 /// One step of a rollout, arm by arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RolloutStep {
-    /// The end effectors after the step, own frames, metres.
+    /// The end effectors after the step, arm frames, metres.
     pub hands: Vec<DVec3>,
     /// The openings of the grippers before the step, of each side, metres. A gripper that holds an object is open as
     /// wide as that.
@@ -165,8 +165,8 @@ impl Rehearsal {
         Ok(Rollout { steps, goal_distances_m, contacts })
     }
 
-    /// Prepares variants of the world for the starts that are drawn from now on. An object that all arms share has none:
-    /// they do not predict how an object that two hands hold behaves.
+    /// Prepares variants of the world for the starts that are drawn from now on. An object that all arms share has
+    /// none: they do not predict how an object that two hands hold behaves.
     pub(super) fn add_variants(&mut self) -> Result<(), SimError> {
         if !TaskSpec::from(self.layout).shares_object() {
             let action_m = self.env.description().hand.action_m;

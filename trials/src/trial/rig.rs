@@ -15,8 +15,8 @@ use tandem_bridge::executor::{Executor, Phase, ResetError, Settings, Stop, Token
 const OWNER: Token = Token(1);
 /// Periods until there are enough good states for a reset.
 const N_WARM_UP: usize = 15;
-/// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres. The
-/// envelope stops the arms at 4.
+/// The torque from which a closed loop yields, and its least increase over that at the motion's start; newton metres.
+/// The envelope stops the arms at 4.
 const YIELD_NM: f64 = 1.5;
 const YIELD_INCREASE_NM: f64 = 0.5;
 /// The longest time from a stop to a reset, periods.
@@ -98,8 +98,8 @@ impl<'a> TrialRig<'a> {
         started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))
     }
 
-    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then hold
-    /// their positions, with their grippers as open as they are. Returns whether the motion came to its end.
+    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then
+    /// hold their positions, with their grippers as open as they are. Returns whether the motion came to its end.
     pub(crate) fn play_yielding(
         &mut self,
         motion: Motion,
@@ -221,13 +221,13 @@ impl<'a> TrialRig<'a> {
         }
         let time_s = self.n_periods as f64 * PERIOD_S;
         let planned = self.executor.reference();
-        let at = |angles: &[Joints]| tool_positions(&self.cell, angles);
+        let tools_at = |angles: &[Joints]| tool_positions(&self.cell, angles);
         let n_arms = self.cell.arms.len();
         let angles: Vec<Joints> = (0..n_arms).map(|arm| *pair.angles(ArmIndex(arm))).collect();
         let tools = PathPoint {
             time_s,
-            planned: planned.map(at).unwrap_or_default(),
-            measured: at(&angles),
+            planned: planned.map(tools_at).unwrap_or_default(),
+            measured: tools_at(&angles),
         };
         let goals = self.goals.at_m.iter().map(|goal| goal.as_vec3().to_array()).collect();
         let goal_tolerance_m = self.goals.tolerance_m;

@@ -11,21 +11,21 @@ use tandem_sim::{Env, Friction, SimError, WorldConfig};
 use crate::trial::rehearsal::{Rollout, goal_distances_m};
 
 /// Factor from the friction of the pads that grasp in the training world, 0.45, to that of rubber pads, 0.8.
-const RUBBER: f32 = 1.8;
+const RUBBER_FACTOR: f32 = 1.8;
 /// The differences of each variant.
 const DIFFERENCES: [Difference; 9] = [
     Difference { friction: 1.0, pads: 1.0, mass: 1.0, offset_m: [0.0, 0.0] },
-    Difference { friction: 0.8, pads: RUBBER, mass: 1.0, offset_m: [0.003, 0.0] },
+    Difference { friction: 0.8, pads: RUBBER_FACTOR, mass: 1.0, offset_m: [0.003, 0.0] },
     Difference { friction: 1.2, pads: 1.0, mass: 1.0, offset_m: [-0.003, 0.0] },
-    Difference { friction: 0.8, pads: RUBBER, mass: 1.0, offset_m: [0.0, 0.003] },
+    Difference { friction: 0.8, pads: RUBBER_FACTOR, mass: 1.0, offset_m: [0.0, 0.003] },
     Difference { friction: 1.2, pads: 1.0, mass: 1.0, offset_m: [0.0, -0.003] },
-    Difference { friction: 1.2, pads: RUBBER, mass: 0.8, offset_m: [0.004, 0.004] },
-    Difference { friction: 0.8, pads: RUBBER, mass: 1.2, offset_m: [-0.004, 0.004] },
+    Difference { friction: 1.2, pads: RUBBER_FACTOR, mass: 0.8, offset_m: [0.004, 0.004] },
+    Difference { friction: 0.8, pads: RUBBER_FACTOR, mass: 1.2, offset_m: [-0.004, 0.004] },
     Difference { friction: 1.0, pads: 1.0, mass: 1.2, offset_m: [-0.004, -0.004] },
-    Difference { friction: 1.0, pads: RUBBER, mass: 0.8, offset_m: [0.004, -0.004] },
+    Difference { friction: 1.0, pads: RUBBER_FACTOR, mass: 0.8, offset_m: [0.004, -0.004] },
 ];
 /// Share of the tolerance within which a robust motion brings the objects to their goals.
-pub(super) const USED_TOLERANCE: f64 = 0.8;
+pub(super) const USED_TOLERANCE_SHARE: f64 = 0.8;
 
 /// The difference between a variant and the training world.
 struct Difference {
@@ -35,7 +35,8 @@ struct Difference {
     pads: f32,
     /// Factor of the objects' masses.
     mass: f32,
-    /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by 180°.
+    /// Displacement of the hands along x and y, frame of the first arm, metres. That of the second one is rotated by
+    /// 180°.
     offset_m: [f32; 2],
 }
 
@@ -99,7 +100,7 @@ impl Variants {
         let distance_m = goal_distances_m(&env, &observation).into_iter().fold(0.0, f64::max);
         let task = TaskSpec::from(self.layout);
         Ok(task.is_success(&observation, env.goal())
-            && distance_m <= USED_TOLERANCE * f64::from(task.tolerance())
+            && distance_m <= USED_TOLERANCE_SHARE * f64::from(task.tolerance())
             && contacts == Contacts::NONE)
     }
 
@@ -239,7 +240,10 @@ mod tests {
         assert_eq!(slippery.table_friction, config.table_friction * 0.8);
         assert_eq!(slippery.pick_and_place.object, config.pick_and_place.object * 0.8);
         let pads = [0, 1].map(|idx| DIFFERENCES[idx].applied_to(&config).pick_and_place.pads);
-        assert_eq!(pads, [config.pick_and_place.pads, config.pick_and_place.pads * 0.8 * RUBBER]);
+        assert_eq!(
+            pads,
+            [config.pick_and_place.pads, config.pick_and_place.pads * 0.8 * RUBBER_FACTOR]
+        );
         assert_eq!(slippery.rubber_pads, config.rubber_pads * 0.8);
     }
 }

@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, TaskSpec};
+use tandem_kinematics::trajectory::DEFAULT_RATE_HZ;
 use tandem_kinematics::{
     ArmWaypoint, CheckSettings, Joints, Motion, PlacedArm, PlanError, PlanSettings, ReachError,
     Waypoint, check, plan,
@@ -9,6 +10,7 @@ use tandem_kinematics::{
 use tandem_sim::SimError;
 
 use crate::simulated::{Block, ObjectPose, SimulatedConfig, SimulatedPair, single};
+use crate::trial::closed_loop::ClosedLoop;
 use crate::trial::mapping::Mapping;
 use crate::trial::outcome::{
     FailureCause, MotionRefusal, ObjectResult, contact_failure, object_failure,
@@ -21,15 +23,13 @@ use crate::trial::{
 };
 use tandem_bridge::work_cell::{check_settings, mico_cell_of};
 
-/// Samples per second of a motion.
-const RATE_HZ: f64 = 100.0;
 /// Time for objects to come to rest before they are evaluated, seconds.
 pub(super) const REST_S: f64 = 0.5;
 /// Room between the arms that a step of the closed loop keeps, metres: more than the check requires, so that the next
 /// step can start.
 pub(super) const STEP_GAP_M: f64 = 0.025;
-/// Angle between a joint of an arm that starts a trial and the end of the joint's range, radians: a little more than the
-/// executor demands of motions.
+/// Angle between a joint of an arm that starts a trial and the end of the joint's range, radians: a little more than
+/// the executor demands of motions.
 const RANGE_ROOM_RAD: f64 = 0.02;
 /// Friction of the twin, as a share of the pair's.
 const TWIN_FRICTION: f32 = 0.8;
@@ -103,20 +103,22 @@ impl TrialRunner {
         observer: &mut dyn TrialObserver,
     ) -> Result<TrialReport, TrialError> {
         let start = self.start(number)?;
-        let at = start_angles(&self.mapping, &start)?;
+        let joint_angles = start_angles(&self.mapping, &start)?;
         let planned = match self.config.mode {
-            TrialMode::OpenLoop => Some(self.rehearse(&start, &at, policy)?),
-            TrialMode::Twin => Some(self.rehearse_on_copy(&start, &at, TWIN_FRICTION, policy)?),
+            TrialMode::OpenLoop => Some(self.rehearse(&start, &joint_angles, policy)?),
+            TrialMode::Twin => {
+                Some(self.rehearse_on_copy(&start, &joint_angles, TWIN_FRICTION, policy)?)
+            }
             TrialMode::ClosedLoop => None,
         };
-        let pair = self.pair(&start, &at, number, &self.config.simulated);
+        let pair = self.pair(&start, &joint_angles, number, &self.config.simulated);
         let initial: Vec<ObjectPose> = pair.objects();
         let at_m = self.in_world(&start.goals);
         let goals = Goals { at_m, tolerance_m: self.task.tolerance() };
         let mut rig = TrialRig::new(self.mapping.cell().clone(), pair, goals, observer)?;
         let execution = match planned {
             Some(motion) => self.open_loop(&mut rig, &start, motion),
-            None => self.closed_loop(&mut rig, &start, &at, policy),
+            None => ClosedLoop::new(self, &mut rig, &start, &joint_angles, policy).run(),
         };
         Ok(self.report(number, &start, &initial, &rig, execution))
     }
@@ -129,14 +131,14 @@ impl TrialRunner {
         rig: &TrialRig<'_>,
         execution: TrialExecution,
     ) -> TrialReport {
-        let own = |arm: usize, at_m: DVec3| self.mapping.object_in_own(ArmIndex(arm), at_m);
+        let in_arm = |arm: usize, at_m: DVec3| self.mapping.object_in_arm(ArmIndex(arm), at_m);
         let ends = rig.pair().objects();
         let objects: Vec<ObjectResult> = (0..ends.len())
             .map(|arm| ObjectResult {
-                start: own(arm, initial[arm].at_m),
+                start: in_arm(arm, initial[arm].at_m),
                 goal: start.goals[arm],
-                end: own(arm, ends[arm].at_m),
-                highest_m: own(arm, DVec3::Z * rig.highest_m[arm]).z,
+                end: in_arm(arm, ends[arm].at_m),
+                highest_m: in_arm(arm, DVec3::Z * rig.highest_m[arm]).z,
             })
             .collect();
         let goals = self.in_world(&start.goals);
@@ -184,7 +186,7 @@ impl TrialRunner {
     /// Returns for each arm the distance from its object to its goal, metres.
     pub(super) fn goal_distances_m(&self, objects: &[ObjectPose], start: &TrialStart) -> Vec<f64> {
         let distance_m = |(arm, (object, goal)): (usize, (&ObjectPose, &DVec3))| {
-            self.mapping.object_in_own(ArmIndex(arm), object.at_m).distance(*goal)
+            self.mapping.object_in_arm(ArmIndex(arm), object.at_m).distance(*goal)
         };
         objects.iter().zip(&start.goals).enumerate().map(distance_m).collect()
     }
@@ -203,25 +205,25 @@ impl TrialRunner {
         })
     }
 
-    /// Plans the motion through `waypoints` from joint angles `at` (radians) and checks it with `settings`.
+    /// Plans the motion through `waypoints` from `joint_angles` (radians) and checks it with `settings`.
     pub(super) fn motion(
         &self,
         waypoints: &[Waypoint],
-        at: &[Joints],
+        joint_angles: &[Joints],
         settings: &CheckSettings,
     ) -> Result<Motion, FailureCause> {
         let cell = self.mapping.cell();
-        let planned = plan(cell, waypoints, at, &PlanSettings::default());
+        let planned = plan(cell, waypoints, joint_angles, &PlanSettings::default());
         let trajectory =
             planned.map_err(|error| FailureCause::Refused(MotionRefusal::Plan(error)))?;
-        let motion = trajectory.sampled(RATE_HZ);
+        let motion = trajectory.sampled(DEFAULT_RATE_HZ);
         let first: Vec<Joints> = motion.arms.iter().map(|samples| samples[0].angles).collect();
         check(cell, &motion, &first, settings)
             .map_err(|refusal| FailureCause::Refused(MotionRefusal::Check(refusal)))?;
         Ok(motion)
     }
 
-    /// Returns the waypoint for end effectors at `hands` (own frames, metres), near joint angles `near` (radians).
+    /// Returns the waypoint for end effectors at `hands` (arm frames, metres), near joint angles `near` (radians).
     pub(super) fn waypoint(
         &self,
         hands: &[DVec3],
@@ -244,29 +246,32 @@ impl TrialRunner {
         let Self { mapping, check, .. } = self;
         let is_free = |start: &TrialStart| {
             // An arm that cannot reach the start is reported later.
-            start_angles(mapping, start).map_or(true, |at| {
-                mapping.cell().gaps(&at).arms_m >= check.arms_gap_m
-                    && mapping.cell().arms.iter().zip(&at).all(|(placed, at)| has_range(placed, at))
+            start_angles(mapping, start).map_or(true, |joint_angles| {
+                let mut arms = mapping.cell().arms.iter().zip(&joint_angles);
+                mapping.cell().gaps(&joint_angles).arms_m >= check.arms_gap_m
+                    && arms.all(|(placed, angles)| has_range(placed, angles))
             })
         };
         self.rehearsal.start(self.config.seed, number, is_free)
     }
 
-    fn in_world(&self, own: &[DVec3]) -> Vec<DVec3> {
-        let point = |(arm, own): (usize, &DVec3)| self.mapping.object_in_world(ArmIndex(arm), *own);
-        own.iter().enumerate().map(point).collect()
+    /// Converts positions of objects or goals, one of each arm, from the arm frames to the world frame, metres.
+    fn in_world(&self, in_arm: &[DVec3]) -> Vec<DVec3> {
+        let point =
+            |(arm, in_arm): (usize, &DVec3)| self.mapping.object_in_world(ArmIndex(arm), *in_arm);
+        in_arm.iter().enumerate().map(point).collect()
     }
 
     pub(super) fn pair(
         &self,
         start: &TrialStart,
-        at: &[Joints],
+        joint_angles: &[Joints],
         number: u64,
         simulated: &SimulatedConfig,
     ) -> SimulatedPair {
-        let block = |(at, yaw_rad): (DVec3, &f64)| {
-            let (at, yaw_rad) = (at.as_vec3(), single(*yaw_rad));
-            Block { at_m: [at.x, at.y], yaw_rad, ..self.config.block }
+        let block = |(position, yaw_rad): (DVec3, &f64)| {
+            let (position, yaw_rad) = (position.as_vec3(), single(*yaw_rad));
+            Block { at_m: [position.x, position.y], yaw_rad, ..self.config.block }
         };
         let points = self.in_world(&start.objects);
         let shared = start.shared.clone().map(|shared| placed(shared, &points));
@@ -281,13 +286,13 @@ impl TrialRunner {
             ..simulated.clone()
         };
         let opening = self.mapping.opening(start.opening_m);
-        SimulatedPair::new(self.mapping.cell().clone(), at, opening, config)
+        SimulatedPair::new(self.mapping.cell().clone(), joint_angles, opening, config)
     }
 }
 
 /// Returns whether every joint keeps [`RANGE_ROOM_RAD`] to the ends of its range.
-fn has_range(placed: &PlacedArm, at: &Joints) -> bool {
-    placed.model.joints.iter().zip(at.iter()).all(|(joint, angle)| {
+fn has_range(placed: &PlacedArm, angles: &Joints) -> bool {
+    placed.model.joints.iter().zip(angles.iter()).all(|(joint, angle)| {
         let [low, high] = joint.range_rad;
         (angle - low).min(high - angle) >= RANGE_ROOM_RAD
     })
@@ -326,10 +331,10 @@ mod tests {
         let mut runner = TrialRunner::new(config).unwrap();
         for number in 0..50 {
             let start = runner.start(number).unwrap();
-            for at in start_angles(&runner.mapping, &start).unwrap() {
+            for angles in start_angles(&runner.mapping, &start).unwrap() {
                 let elbow = &runner.mapping.cell().arms[0].model.joints[2];
-                let [low, high] = elbow.range_rad.map(|end| (at[2] - end).abs());
-                assert!(low.min(high) > least_rad, "trial {number}: {at:?}");
+                let [low, high] = elbow.range_rad.map(|end| (angles[2] - end).abs());
+                assert!(low.min(high) > least_rad, "trial {number}: {angles:?}");
             }
         }
     }

@@ -18,39 +18,40 @@ pub(crate) fn shared_object(world: &WorldDescription, shown: &[Cuboid]) -> Share
         }
         Geometry::CapsuleRadiusAndHalfLengthM(_) => None,
     });
-    let turn = shown.first().map_or(Quat::IDENTITY, |first| Quat::from_array(first.orientation));
-    let at = match (shown.first(), points.first()) {
-        (Some(first), Some(point)) => Vec3::from(first.centre) - turn * *point,
+    let rotation =
+        shown.first().map_or(Quat::IDENTITY, |first| Quat::from_array(first.orientation));
+    let position = match (shown.first(), points.first()) {
+        (Some(first), Some(point)) => Vec3::from(first.centre) - rotation * *point,
         _ => Vec3::ZERO,
     };
     let in_body = |shown: &Cuboid| Cuboid {
-        centre: (turn.inverse() * (Vec3::from(shown.centre) - at)).to_array(),
-        orientation: (turn.inverse() * Quat::from_array(shown.orientation)).to_array(),
+        centre: (rotation.inverse() * (Vec3::from(shown.centre) - position)).to_array(),
+        orientation: (rotation.inverse() * Quat::from_array(shown.orientation)).to_array(),
         half_extents_m: shown.half_extents_m,
     };
-    let ahead = turn * Vec3::X;
+    let ahead = rotation * Vec3::X;
     SharedObject {
         boxes: boxes.collect(),
         shown: shown.iter().map(in_body).collect(),
         points_m: points.iter().map(Vec3::to_array).collect(),
-        at_m: at.to_array(),
+        at_m: position.to_array(),
         yaw_rad: libm::atan2f(ahead.y, ahead.x),
     }
 }
 
-/// Returns `object` with the points of its arms at `points` (world frame, metres), as far as a rigid body that stays level
-/// can have them there.
+/// Returns `object` with the points of its arms at `points` (world frame, metres), as far as a rigid body that stays
+/// level can have them there.
 pub(crate) fn placed(object: SharedObject, points: &[DVec3]) -> SharedObject {
     let ([first, second], [from, to]) = (&object.points_m[..], points) else { return object };
-    let own = Vec3::from(*second) - Vec3::from(*first);
+    let in_body = Vec3::from(*second) - Vec3::from(*first);
     let (along, middle) = ((*to - *from).as_vec3(), from.midpoint(*to).as_vec3());
-    let yaw_rad = libm::atan2f(along.y, along.x) - libm::atan2f(own.y, own.x);
-    let own_middle = Vec3::from(*first).midpoint(Vec3::from(*second));
-    let at = middle - turned(yaw_rad) * own_middle;
-    SharedObject { at_m: at.to_array(), yaw_rad, ..object }
+    let yaw_rad = libm::atan2f(along.y, along.x) - libm::atan2f(in_body.y, in_body.x);
+    let middle_in_body = Vec3::from(*first).midpoint(Vec3::from(*second));
+    let position = middle - rotation_about_z(yaw_rad) * middle_in_body;
+    SharedObject { at_m: position.to_array(), yaw_rad, ..object }
 }
 
-fn turned(yaw_rad: f32) -> Quat {
+fn rotation_about_z(yaw_rad: f32) -> Quat {
     let (sin, cos) = libm::sincosf(0.5 * yaw_rad);
     Quat::from_xyzw(0.0, 0.0, sin, cos)
 }

@@ -23,7 +23,7 @@ pub struct TrainingHand {
     acceleration_mps2: f64,
     /// The displacement of an action of 1, metres.
     action_m: f64,
-    /// The workspace of the end effector, own frame: low and high corner, metres.
+    /// The workspace of the end effector, arm frame: low and high corner, metres.
     workspace_m: [DVec3; 2],
     /// The part of the workspace that the arm reaches; all of it if there is none.
     reach: Option<&'static Reach>,
@@ -60,7 +60,7 @@ impl TrainingHand {
     }
 
     /// Returns the position and velocity of the hand after a step with `action` (one arm's, shape `[action_per_arm]`,
-    /// in [−1, 1]) from `hand` with `velocity`; own frame, metres and metres per second.
+    /// in [−1, 1]) from `hand` with `velocity`; arm frame, metres and metres per second.
     ///
     /// # Panics
     /// Panics if the action has fewer than three numbers.
@@ -71,24 +71,24 @@ impl TrainingHand {
         let target = self.reachable(hand + displacement);
         let substep_s = self.control_step_s / f64::from(self.n_substeps);
         let most = DVec3::splat(self.acceleration_mps2 * substep_s);
-        let (mut at, mut velocity) = (hand, velocity);
+        let (mut position, mut velocity) = (hand, velocity);
         for _ in 0..self.n_substeps {
-            let desired = (target - at) * self.gain_per_s;
+            let desired = (target - position) * self.gain_per_s;
             let desired =
                 self.max_speed_mps.map_or(desired, |speed| desired.clamp_length_max(speed));
             velocity += (desired - velocity).clamp(-most, most);
-            at += velocity * substep_s;
+            position += velocity * substep_s;
         }
-        (self.reachable(at), velocity)
+        (self.reachable(position), velocity)
     }
 
-    /// Returns the nearest position to `at` that the hand may have; own frame, metres.
+    /// Returns the nearest position to `position` that the hand may have; arm frame, metres.
     #[must_use]
-    pub fn reachable(&self, at: DVec3) -> DVec3 {
+    pub fn reachable(&self, position: DVec3) -> DVec3 {
         let [low, high] = self.workspace_m;
-        let at = at.clamp(low, high);
-        self.reach.map_or(at, |reach| {
-            let reached = reach.clamp(at.as_vec3());
+        let position = position.clamp(low, high);
+        self.reach.map_or(position, |reach| {
+            let reached = reach.clamp(position.as_vec3());
             let [nearest_m, _] = reach.radii_m(reached.z);
             let radius_m = reach.radius_m(reached.to_array());
             let missing_m = (nearest_m + FOLDED_ROOM_M - radius_m).max(0.0);
@@ -146,12 +146,12 @@ mod tests {
         let ahead = [1.0, 0.0, 0.0, 0.0];
         for (task, farthest_m) in [(Task::PickAndPlace, 0.05), (Task::CarryBar, 0.05)] {
             let hand = hand_of(task);
-            let (at, velocity) = hand.after(DVec3::ZERO, DVec3::ZERO, &ahead);
-            assert!(at.x > 0.02 && at.x < farthest_m, "{task}: {at}");
-            let (glided, _) = hand.after(at, velocity, &[0.0; 4]);
-            assert!(glided.x > at.x, "{task}: {glided}");
+            let (position, velocity) = hand.after(DVec3::ZERO, DVec3::ZERO, &ahead);
+            assert!(position.x > 0.02 && position.x < farthest_m, "{task}: {position}");
+            let (glided, _) = hand.after(position, velocity, &[0.0; 4]);
+            assert!(glided.x > position.x, "{task}: {glided}");
             let low_z = hand.workspace_m[0].z;
-            assert!((at.z - low_z).abs() < 1e-12, "{task}: the workspace's floor");
+            assert!((position.z - low_z).abs() < 1e-12, "{task}: the workspace's floor");
         }
         let shared = hand_of(Task::SharedPush);
         let (far, _) = shared.after(DVec3::new(0.2, 0.15, 0.3), DVec3::ZERO, &ahead);

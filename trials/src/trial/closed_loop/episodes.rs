@@ -1,20 +1,17 @@
 //! Episodes of a trial in the closed loop.
 //!
-//! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was trained
-//! with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns if their
-//! objects could meet ([`super::order`]) or if they block each other.
+//! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was
+//! trained with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns
+//! if their objects could meet ([`super::order`]) or if they block each other.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
-use tandem_kinematics::Joints;
 
-use super::{DONE_SHARE, LoopState, WantedStep};
+use super::{ClosedLoop, DONE_SHARE, LoopState, WantedStep};
 use crate::simulated::ObjectPose;
-use crate::trial::ActionSource;
 use crate::trial::noise::add_noise;
 use crate::trial::outcome::FailureCause;
 use crate::trial::rehearsal::TrialStart;
-use crate::trial::rig::TrialRig;
 use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
 /// A policy is done after this many consecutive observations of placed objects that stay there.
@@ -22,13 +19,13 @@ const DONE_OBSERVATIONS: usize = 5;
 /// An arm makes way when the steps that the arms did not carry out in full outnumber the others by this many.
 const MAX_BLOCKED: usize = 10;
 /// Height above the table, metres, below which an object lies on it.
-const LYING_M: f64 = 0.01;
+const LYING_HEIGHT_M: f64 = 0.01;
 /// Height by which a hand rises before it withdraws, metres.
 const RISE_M: f64 = 0.06;
 
 /// What follows a step when arms block each other or an arm waits.
 #[derive(Debug, PartialEq)]
-enum Turn {
+enum NextAction {
     /// All arms continue as before.
     Same,
     /// These arms retreat and keep out of the way; the others continue.
@@ -37,93 +34,80 @@ enum Turn {
     NextEpisode,
 }
 
-impl TrialRunner {
-    /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object have
-    /// one episode.
-    pub(in crate::trial) fn closed_loop(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        at: &[Joints],
-        policy: &mut dyn ActionSource,
-    ) -> TrialExecution {
-        let mut execution = TrialExecution {
-            ended: Ok(()),
-            n_steps: 0,
-            n_shortened: 0,
+impl ClosedLoop<'_, '_> {
+    /// Runs the closed loop until the objects are placed, the time is over or a step fails. Arms that share an object
+    /// have one episode.
+    pub(in crate::trial) fn run(mut self) -> TrialExecution {
+        let ended = self.episodes();
+        self.state.count_success(self.runner.is_success(self.rig, self.start));
+        TrialExecution {
+            ended,
+            n_steps: self.n_steps,
+            n_shortened: self.n_shortened,
             rehearsed_m: None,
-            timed_out: false,
-            n_in_success: 0,
-            waypoints: Vec::new(),
-        };
-        let mut state = LoopState::new(start, at);
-        execution.ended = self.episodes(rig, start, &mut state, policy, &mut execution);
-        state.count_success(self.is_success(rig, start));
-        execution.n_in_success = state.n_in_success;
-        execution.waypoints = state.waypoints;
-        execution
+            timed_out: self.timed_out,
+            n_in_success: self.state.n_in_success,
+            waypoints: self.state.waypoints,
+        }
     }
 
-    fn episodes(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-        policy: &mut dyn ActionSource,
-        execution: &mut TrialExecution,
-    ) -> Result<(), FailureCause> {
-        let time_limit_s = self.config.time_limit_s / self.config.speed;
+    fn episodes(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
+        let shares_object = runner.task.shares_object();
+        let time_limit_s = runner.config.time_limit_s / runner.config.speed;
         let (mut n_in_episode, mut n_blocked) = (0, 0_usize);
-        self.order_arms(rig, start, state)?;
+        self.order_arms()?;
         loop {
-            if state.n_done == DONE_OBSERVATIONS {
-                rig.wait(REST_S)?;
-                if self.task.shares_object()
-                    || !self.misplaced(&rig.observe_objects()?, start).any(|misplaced| misplaced)
+            if self.state.n_done == DONE_OBSERVATIONS {
+                self.rig.wait(REST_S)?;
+                if shares_object
+                    || !runner
+                        .misplaced(&self.rig.observe_objects()?, start)
+                        .any(|misplaced| misplaced)
                 {
                     return Ok(());
                 }
-                state.n_done = 0;
+                self.state.n_done = 0;
             }
-            execution.timed_out = rig.now_s() > time_limit_s;
-            let is_over = n_in_episode == self.task.episode_steps();
-            if execution.timed_out || is_over && self.task.shares_object() {
-                return rig.wait(REST_S);
+            self.timed_out = self.rig.now_s() > time_limit_s;
+            let is_over = n_in_episode == runner.task.episode_steps();
+            if self.timed_out || is_over && shares_object {
+                return self.rig.wait(REST_S);
             }
             if is_over {
-                self.start_next_episode(rig, start, state)?;
+                self.start_next_episode()?;
                 n_in_episode = 0;
             }
-            execution.n_steps += 1;
+            self.n_steps += 1;
             // Steps in which an arm waited or went only part of its way do not count: the policy's episode has none.
-            if self.step(rig, start, state, policy)? {
+            if self.step()? {
                 n_in_episode += 1;
                 n_blocked = n_blocked.saturating_sub(1);
             } else {
-                execution.n_shortened += 1;
+                self.n_shortened += 1;
                 n_blocked += 1;
             }
-            if self.task.shares_object() {
+            if shares_object {
                 continue;
             }
-            self.nudge(rig, state)?;
-            let is_idle = self.config.layout.task.grasps() && state.progress.is_idle();
+            self.nudge()?;
+            let is_idle = runner.config.layout.task.grasps() && self.state.progress.is_idle();
             let is_blocked = n_blocked == MAX_BLOCKED || is_idle;
             if is_blocked {
                 n_blocked = 0;
-                state.progress.start_again();
+                self.state.progress.start_again();
             }
-            if is_blocked || state.parked.contains(&true) {
-                let objects = rig.observe_objects()?;
-                match self.next_turn(&objects, start, state, is_blocked) {
-                    Turn::Same => {}
-                    Turn::Parks(parks) => {
-                        self.retreat(rig, state, &parks)?;
-                        state.parked = parks;
+            if is_blocked || self.state.parked.contains(&true) {
+                let objects = self.rig.observe_objects()?;
+                match runner.next_action(&objects, start, &mut self.state, is_blocked) {
+                    NextAction::Same => {}
+                    NextAction::Parks(parks) => {
+                        self.retreat(&parks)?;
+                        self.state.parked = parks;
                         n_in_episode = 0;
                     }
-                    Turn::NextEpisode => {
-                        self.start_next_episode(rig, start, state)?;
+                    NextAction::NextEpisode => {
+                        self.start_next_episode()?;
                         n_in_episode = 0;
                     }
                 }
@@ -131,26 +115,70 @@ impl TrialRunner {
         }
     }
 
+    /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
+    fn start_next_episode(&mut self) -> Result<(), FailureCause> {
+        let (runner, start) = (self.runner, self.start);
+        let objects = self.rig.observe_objects()?;
+        let misplaced: Vec<bool> = runner.misplaced(&objects, start).collect();
+        self.retreat(&misplaced)?;
+        self.recall()?;
+        let (seed, state) = (runner.config.seed, &mut self.state);
+        state.parked.fill(false);
+        state.before = None;
+        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
+        self.order_arms()
+    }
+
+    /// Opens the grippers of the `retreating` arms unless they hold an object above the table, raises their hands and
+    /// withdraws them toward their bases, as far as the check allows.
+    pub(super) fn retreat(&mut self, retreating: &[bool]) -> Result<(), FailureCause> {
+        let runner = self.runner;
+        let objects = self.rig.observe_objects()?;
+        let blocks = runner.observed_blocks(&objects, None);
+        let grasps = runner.config.layout.task.grasps();
+        let open_m = if grasps { runner.mapping.max_opening_m() } else { 0.0 };
+        let lifted: Vec<bool> = runner.lying(&objects).map(|lies| !lies).collect();
+        let raised = |hand: DVec3| runner.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
+        let withdrawn = |hand: DVec3| runner.mapping.withdrawn_hand(hand);
+        let targets: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
+        for target in targets {
+            let mut hands = runner.hands(&self.state);
+            let mut openings_m = self.state.openings_m.clone();
+            for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
+                hands[arm] = target(hands[arm]);
+                if !lifted[arm] {
+                    openings_m[arm] = open_m;
+                }
+            }
+            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
+            self.attempt(&wanted, &wanted.hands, &runner.check)?;
+        }
+        self.state.velocities.fill(DVec3::ZERO);
+        Ok(())
+    }
+}
+
+impl TrialRunner {
     /// Decides which arms make way: those whose objects lie at their goals on the table. If there are none and the arms
-    /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next time
-    /// the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its turn
-    /// comes when the object of the other one lies at its goal.
-    fn next_turn(
+    /// block each other, one arm waits for its turn, at first the one whose object is farther from its goal, the next
+    /// time the other one; an arm whose object is at its goal above the table waits before one whose object is not. Its
+    /// turn comes when the object of the other one lies at its goal.
+    fn next_action(
         &self,
         objects: &[ObjectPose],
         start: &TrialStart,
         state: &mut LoopState,
         is_blocked: bool,
-    ) -> Turn {
+    ) -> NextAction {
         let misplaced: Vec<bool> = self.misplaced(objects, start).collect();
         let is_waiting =
             misplaced.iter().zip(&state.parked).any(|(misplaced, parked)| *misplaced && *parked);
         let parks = self.parking(objects, &misplaced, state);
         if (is_blocked || is_waiting) && parks.contains(&true) {
-            return Turn::Parks(parks);
+            return NextAction::Parks(parks);
         }
         if !is_blocked {
-            return Turn::Same;
+            return NextAction::Same;
         }
         match self.goal_distances_m(objects, start)[..] {
             [one_m, other_m] if !state.parked.contains(&true) => {
@@ -159,27 +187,10 @@ impl TrialRunner {
                 let is_other_placed = misplaced[farther] && !misplaced[1 - farther];
                 let waiting = (farther + usize::from(is_other_placed) + state.n_waits) % 2;
                 state.n_waits += 1;
-                Turn::Parks(vec![waiting == 0, waiting == 1])
+                NextAction::Parks(vec![waiting == 0, waiting == 1])
             }
-            _ => Turn::NextEpisode,
+            _ => NextAction::NextEpisode,
         }
-    }
-
-    /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
-    fn start_next_episode(
-        &self,
-        rig: &mut TrialRig<'_>,
-        start: &TrialStart,
-        state: &mut LoopState,
-    ) -> Result<(), FailureCause> {
-        let misplaced: Vec<bool> = self.misplaced(&rig.observe_objects()?, start).collect();
-        self.retreat(rig, state, &misplaced)?;
-        self.recall(rig, start, state)?;
-        state.parked.fill(false);
-        state.before = None;
-        let seed = self.config.seed;
-        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
-        self.order_arms(rig, start, state)
     }
 
     /// Returns the arms that are not parked and whose objects are not `misplaced` and lie on the table.
@@ -191,41 +202,9 @@ impl TrialRunner {
     /// Returns for each arm whether its object lies on the table.
     pub(super) fn lying(&self, objects: &[ObjectPose]) -> impl Iterator<Item = bool> {
         objects.iter().enumerate().map(|(arm, object)| {
-            let height_m = self.mapping.object_in_own(ArmIndex(arm), object.at_m).z;
-            height_m - self.config.trained_half_m < LYING_M
+            let height_m = self.mapping.object_in_arm(ArmIndex(arm), object.at_m).z;
+            height_m - self.config.trained_half_m < LYING_HEIGHT_M
         })
-    }
-
-    /// Opens the grippers of the `retreating` arms unless they hold an object above the table, raises their hands and
-    /// withdraws them toward their bases, as far as the check allows.
-    pub(super) fn retreat(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-        retreating: &[bool],
-    ) -> Result<(), FailureCause> {
-        let objects = rig.observe_objects()?;
-        let blocks = self.observed_blocks(&objects, None);
-        let grasps = self.config.layout.task.grasps();
-        let open_m = if grasps { self.mapping.max_opening_m() } else { 0.0 };
-        let lifted: Vec<bool> = self.lying(&objects).map(|lies| !lies).collect();
-        let raised = |hand: DVec3| self.mapping.reachable_hand(hand + DVec3::Z * RISE_M);
-        let withdrawn = |hand: DVec3| self.mapping.withdrawn_hand(hand);
-        let ways: [&dyn Fn(DVec3) -> DVec3; 3] = [&|hand| hand, &raised, &withdrawn];
-        for way in ways {
-            let mut hands = self.hands(state);
-            let mut openings_m = state.openings_m.clone();
-            for arm in (0..hands.len()).filter(|arm| retreating[*arm]) {
-                hands[arm] = way(hands[arm]);
-                if !lifted[arm] {
-                    openings_m[arm] = open_m;
-                }
-            }
-            let wanted = WantedStep { hands, openings_m, blocks: &blocks };
-            self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
-        }
-        state.velocities.fill(DVec3::ZERO);
-        Ok(())
     }
 
     /// Replaces what the policy wants of parked arms: they stay where they are.
@@ -271,8 +250,8 @@ mod tests {
         let config = test_config(Task::SharedPickAndPlace, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         state.parked[1] = true;
         let hands = runner.hands(&state);
         let moved: Vec<DVec3> = hands.iter().map(|hand| *hand + DVec3::X * 0.05).collect();
@@ -288,39 +267,39 @@ mod tests {
         let config = test_config(Task::SharedPush, TrialMode::ClosedLoop, 1);
         let mut runner = TrialRunner::new(config).unwrap();
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let objects = |distances_m: [f64; 2]| {
             let pose = |(arm, distance_m): (usize, f64)| {
-                let own = start.goals[arm] + DVec3::X * distance_m;
-                let at_m = runner.mapping.object_in_world(ArmIndex(arm), own);
-                ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+                let in_arm = start.goals[arm] + DVec3::X * distance_m;
+                let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm);
+                ObjectPose { at_m, orientation: DQuat::IDENTITY, time_s: 0.0 }
             };
             distances_m.into_iter().enumerate().map(pose).collect::<Vec<_>>()
         };
         let neither = objects([0.1, 0.2]);
-        let mut turn = |objects: &[ObjectPose], parked: [bool; 2], is_blocked| {
+        let mut next = |objects: &[ObjectPose], parked: [bool; 2], is_blocked| {
             state.parked = parked.to_vec();
-            runner.next_turn(objects, &start, &mut state, is_blocked)
+            runner.next_action(objects, &start, &mut state, is_blocked)
         };
-        let parks = |arms: [bool; 2]| Turn::Parks(arms.to_vec());
-        assert_eq!(turn(&neither, [false; 2], false), Turn::Same);
-        assert_eq!(turn(&neither, [false; 2], true), parks([false, true]), "the farther one waits");
-        assert_eq!(turn(&neither, [false, true], false), Turn::Same);
+        let parks = |arms: [bool; 2]| NextAction::Parks(arms.to_vec());
+        assert_eq!(next(&neither, [false; 2], false), NextAction::Same);
+        assert_eq!(next(&neither, [false; 2], true), parks([false, true]), "the farther one waits");
+        assert_eq!(next(&neither, [false, true], false), NextAction::Same);
         let first = objects([0.0, 0.2]);
         assert_eq!(
-            turn(&first, [false, true], false),
+            next(&first, [false, true], false),
             parks([true, false]),
             "the other one's turn"
         );
-        assert_eq!(turn(&first, [true, false], false), Turn::Same, "nothing waits");
+        assert_eq!(next(&first, [true, false], false), NextAction::Same, "nothing waits");
         assert_eq!(
-            turn(&neither, [false, true], true),
-            Turn::NextEpisode,
+            next(&neither, [false, true], true),
+            NextAction::NextEpisode,
             "blocked although one waits"
         );
-        assert_eq!(turn(&neither, [false; 2], true), parks([true, false]), "roles alternate");
-        assert_eq!(turn(&first, [false; 2], true), parks([true, false]), "placed ones make way");
+        assert_eq!(next(&neither, [false; 2], true), parks([true, false]), "roles alternate");
+        assert_eq!(next(&first, [false; 2], true), parks([true, false]), "placed ones make way");
     }
 
     #[test]
@@ -329,16 +308,16 @@ mod tests {
         let mut runner = TrialRunner::new(config).unwrap();
         let mut start = runner.start(0).unwrap();
         start.goals[0].z = 0.15;
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
-        let own = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
+        let in_arm = [start.goals[0], start.goals[1] + DVec3::X * 0.2];
         let pose = |arm: usize| {
-            let at_m = runner.mapping.object_in_world(ArmIndex(arm), own[arm]);
-            ObjectPose { at_m, turn: DQuat::IDENTITY, time_s: 0.0 }
+            let at_m = runner.mapping.object_in_world(ArmIndex(arm), in_arm[arm]);
+            ObjectPose { at_m, orientation: DQuat::IDENTITY, time_s: 0.0 }
         };
         let objects = [0, 1].map(pose);
         assert_eq!(runner.lying(&objects).next(), Some(false));
-        let turn = runner.next_turn(&objects, &start, &mut state, true);
-        assert_eq!(turn, Turn::Parks(vec![true, false]), "the misplaced one is farther");
+        let next = runner.next_action(&objects, &start, &mut state, true);
+        assert_eq!(next, NextAction::Parks(vec![true, false]), "the misplaced one is farther");
     }
 }

@@ -1,38 +1,38 @@
 //! Changes to the steps of a policy that grasps, so that a gripper opens and closes where it should.
 //!
-//! The training world's hand opens and closes its gripper while it moves, an arm does so after each step. Pads that close too
-//! early end on the edge of their object, pads that grasp it off its middle or close too late lose it, pads that open too
-//! late push it ahead, and so does a hand that misses it.
+//! The training world's hand opens and closes its gripper while it moves, an arm does so after each step. Pads that
+//! close too early end on the edge of their object, pads that grasp it off its middle or close too late lose it, pads
+//! that open too late push it ahead, and so does a hand that misses it.
 
 use glam::{DVec3, EulerRot};
 
-use super::sparing::{BETWEEN_M, HELD_M};
+use super::sparing::{BETWEEN_PADS_DISTANCE_M, HELD_DISTANCE_M};
 use super::{LoopState, WantedStep};
 use crate::trial::mapping::ArmObservation;
 use crate::trial::runner::TrialRunner;
 
 /// The point between the pads is at most this far above an object's centre when the pads are beside the object, metres.
-const BESIDE_M: f64 = 0.015;
+const BESIDE_HEIGHT_M: f64 = 0.015;
 /// Horizontal distance from a hand to an object that it may be about to grasp, metres.
-const NEAR_M: f64 = 0.08;
+const APPROACH_DISTANCE_M: f64 = 0.08;
 /// A hand that has been held up for this many steps is open no wider than its object needs.
-const N_WIDE: usize = 2;
+const N_WIDE_STEPS: usize = 2;
 /// A gripper that is further open than commanded by this much holds something, metres on each side.
-const HOLDS_M: f64 = 0.003;
+const HOLDING_EXCESS_M: f64 = 0.003;
 /// A gripper that is open wider than an object by this much does not hold it, metres on each side.
-const OPEN_M: f64 = 0.002;
+const EMPTY_EXCESS_M: f64 = 0.002;
 /// What a narrow gripper keeps between its pads and an object, metres on each side.
 const CLEARANCE_M: f64 = 0.005;
 /// A hand is about to grasp its object if it ends less than this above the object's centre, metres.
-const GRASP_M: f64 = 0.07;
+const GRASP_HEIGHT_M: f64 = 0.07;
 /// The object is then less than this away, horizontally, metres.
-const OFF_CENTRE_M: f64 = 0.035;
+const GRASP_DISTANCE_M: f64 = 0.035;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further until
-    /// its pads are beside the object, and one that another object has held up opens no wider than its own needs. A hand
-    /// that is about to grasp goes to the middle of its object, and stays there until its gripper holds the object. One
-    /// beside its object stays where it is until the object fits between its pads.
+    /// Replaces what the policy wants of the hand of `arm`. A gripper that descends to its object closes no further
+    /// until its pads are beside the object, and one that another object has held up opens no wider than its own needs.
+    /// A hand that is about to grasp goes to the middle of its object, and stays there until its gripper holds the
+    /// object. One beside its object stays where it is until the object fits between its pads.
     pub(super) fn prepare_grasp(
         &self,
         arm: usize,
@@ -58,13 +58,13 @@ impl TrialRunner {
         }
     }
 
-    /// Decides whether the gripper of `arm` is open no wider than its object needs: once another object holds it up, until
-    /// it is far from its own.
+    /// Decides whether the gripper of `arm` is open no wider than its object needs: once another object holds it up,
+    /// until it is far from its own.
     fn stays_narrow(&self, arm: usize, state: &mut LoopState, now: &ArmObservation) -> bool {
         let apart_m = (now.object - now.hand).truncate().length();
-        if state.progress.n_held_up(arm) >= N_WIDE && apart_m < OFF_CENTRE_M {
+        if state.progress.n_held_up(arm) >= N_WIDE_STEPS && apart_m < GRASP_DISTANCE_M {
             state.narrow[arm] = true;
-        } else if apart_m > 2.0 * OFF_CENTRE_M {
+        } else if apart_m > 2.0 * GRASP_DISTANCE_M {
             state.narrow[arm] = false;
         }
         state.narrow[arm]
@@ -72,18 +72,18 @@ impl TrialRunner {
 
     /// The opening between which the object fits as it is rotated, metres on each side.
     fn narrow_opening_m(&self, now: &ArmObservation) -> f64 {
-        let (sin, cos) = libm::sincos(now.turn.to_euler(EulerRot::ZYX).0);
+        let (sin, cos) = libm::sincos(now.orientation.to_euler(EulerRot::ZYX).0);
         (sin.abs() + cos.abs()) * self.config.trained_half_m + CLEARANCE_M
     }
 
-    /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it moves
-    /// `to` (own frame, metres) with an opening of `opening_m`.
+    /// Returns whether a hand whose gripper is open, commanded to `commanded_m`, is about to grasp its object if it
+    /// moves `to` (arm frame, metres) with an opening of `opening_m`.
     fn grasps(&self, commanded_m: f64, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         self.is_empty(commanded_m, now)
             && (to.z < now.hand.z || opening_m < commanded_m)
-            && to.z < now.object.z + GRASP_M
-            && ((now.object - to).truncate().length() < OFF_CENTRE_M
-                || (now.object - now.hand).truncate().length() < BETWEEN_M)
+            && to.z < now.object.z + GRASP_HEIGHT_M
+            && ((now.object - to).truncate().length() < GRASP_DISTANCE_M
+                || (now.object - now.hand).truncate().length() < BETWEEN_PADS_DISTANCE_M)
     }
 
     /// Returns whether the object is between the pads of a gripper that is commanded to `commanded_m` and closes to
@@ -92,24 +92,25 @@ impl TrialRunner {
         let to_object = now.object - now.hand;
         opening_m < commanded_m
             && self.is_empty(commanded_m, now)
-            && to_object.truncate().length() < BETWEEN_M
-            && to_object.z.abs() < BESIDE_M
+            && to_object.truncate().length() < BETWEEN_PADS_DISTANCE_M
+            && to_object.z.abs() < BESIDE_HEIGHT_M
     }
 
-    /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and holds
-    /// nothing.
+    /// Returns whether a gripper commanded to `commanded_m` (metres on each side) is wider open than its object and
+    /// holds nothing.
     fn is_empty(&self, commanded_m: f64, now: &ArmObservation) -> bool {
-        now.opening_m > self.config.trained_half_m + OPEN_M && !holds(commanded_m, now)
+        now.opening_m > self.config.trained_half_m + EMPTY_EXCESS_M && !holds(commanded_m, now)
     }
 
-    /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a hand that
-    /// moves `to` (own frame, metres) the object.
+    /// Returns whether a gripper beside its object opens, to `opening_m` metres, and is not open wide enough yet for a
+    /// hand that moves `to` (arm frame, metres) the object.
     fn opens_beside(&self, now: &ArmObservation, to: DVec3, opening_m: f64) -> bool {
         let to_object = now.object - now.hand;
         opening_m > now.opening_m
             && now.opening_m < self.narrow_opening_m(now)
             && to_object.z.abs() < self.config.trained_half_m
-            && (BETWEEN_M..NEAR_M).contains(&to_object.truncate().length())
+            && (BETWEEN_PADS_DISTANCE_M..APPROACH_DISTANCE_M)
+                .contains(&to_object.truncate().length())
             && (to - now.hand).truncate().dot(to_object.truncate()) > 0.0
     }
 
@@ -122,7 +123,7 @@ impl TrialRunner {
         let mut seen = now.to_vec();
         if self.config.layout.task.grasps() && !self.task.shares_object() {
             for (seen, commanded_m) in seen.iter_mut().zip(&state.openings_m) {
-                let is_near = (seen.object - seen.hand).truncate().length() < HELD_M;
+                let is_near = (seen.object - seen.hand).truncate().length() < HELD_DISTANCE_M;
                 if is_near && holds(*commanded_m, seen) {
                     seen.opening_m = seen.opening_m.min(self.config.trained_half_m);
                 }
@@ -134,15 +135,15 @@ impl TrialRunner {
 
 /// Returns whether a gripper commanded to `commanded_m` (metres on each side) holds something.
 fn holds(commanded_m: f64, now: &ArmObservation) -> bool {
-    commanded_m < now.opening_m - HOLDS_M
+    commanded_m < now.opening_m - HOLDING_EXCESS_M
 }
 
-/// Returns whether a hand that moves `to` (own frame, metres) descends to its object and ends with its pads higher than
-/// [`BESIDE_M`] above the object's centre.
+/// Returns whether a hand that moves `to` (arm frame, metres) descends to its object and ends with its pads higher than
+/// [`BESIDE_HEIGHT_M`] above the object's centre.
 fn descends_to_object(now: &ArmObservation, to: DVec3) -> bool {
     to.z < now.hand.z
-        && to.z > now.object.z + BESIDE_M
-        && (now.object - to).truncate().length() < NEAR_M
+        && to.z > now.object.z + BESIDE_HEIGHT_M
+        && (now.object - to).truncate().length() < APPROACH_DISTANCE_M
 }
 
 #[cfg(test)]
@@ -209,8 +210,8 @@ mod tests {
     fn a_held_object_looks_as_in_the_training_world() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let half_m = runner.config.trained_half_m;
         let object = DVec3::new(0.1, 0.0, 0.03);
         // Held by two edges, so that the gripper is further open than the object is wide.
@@ -229,8 +230,8 @@ mod tests {
     fn a_gripper_that_another_object_holds_up_becomes_narrow() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         let object = DVec3::new(0.1, 0.0, 0.03);
         let above = seen(object.with_z(0.1), object);
         let mut opening_m = |now: ArmObservation| {
@@ -246,7 +247,7 @@ mod tests {
         let narrow_m = runner.config.trained_half_m + CLEARANCE_M;
         assert_eq!(opening_m(above), [narrow_m, 0.06]);
         let yaw = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_4);
-        let wider_m = opening_m(ArmObservation { turn: yaw, ..above })[0];
+        let wider_m = opening_m(ArmObservation { orientation: yaw, ..above })[0];
         assert!((wider_m - CLEARANCE_M - 2.0_f64.sqrt() * (narrow_m - CLEARANCE_M)).abs() < 1e-9);
         let away = ArmObservation { hand: above.hand + DVec3::X * 0.1, ..above };
         assert_eq!(opening_m(away), [0.06, 0.06]);

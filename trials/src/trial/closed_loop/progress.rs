@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 /// An object that is displaced by less rests, metres.
-const REST_M: f64 = 0.015;
+const REST_TOLERANCE_M: f64 = 0.015;
 /// The arms are idle when all misplaced objects have rested for this many steps.
 const MAX_IDLE: usize = 20;
 
@@ -13,7 +13,7 @@ pub(super) struct Progress {
     held_up: Vec<bool>,
     /// The number of consecutive steps, up to the last one, after which that was so.
     n_held_up: Vec<usize>,
-    /// Where the objects were when a misplaced one was last displaced, own frames, metres.
+    /// Where the objects were when a misplaced one was last displaced, arm frames, metres.
     rested: Vec<DVec3>,
     /// The number of observations since.
     n_idle: usize,
@@ -35,15 +35,16 @@ impl Progress {
         self.held_up.contains(&true)
     }
 
-    /// Counts a step that starts with the objects at `objects`, own frames, metres. `misplaced` says which of them are away
-    /// from their goals.
+    /// Counts a step that starts with the objects at `objects`, arm frames, metres. `misplaced` says which of them are
+    /// away from their goals.
     pub(super) fn see(&mut self, objects: &[DVec3], misplaced: &[bool]) {
         for (n_held_up, is_held_up) in self.n_held_up.iter_mut().zip(&self.held_up) {
             *n_held_up = if *is_held_up { *n_held_up + 1 } else { 0 };
         }
         let mut each = objects.iter().zip(misplaced).zip(&self.rested);
-        let rests = each
-            .all(|((object, misplaced), rested)| !misplaced || (object - rested).length() < REST_M);
+        let rests = each.all(|((object, misplaced), rested)| {
+            !misplaced || (object - rested).length() < REST_TOLERANCE_M
+        });
         if rests && self.rested.len() == objects.len() {
             self.n_idle += 1;
         } else {
@@ -96,8 +97,8 @@ mod tests {
     fn arms_are_idle_until_a_misplaced_object_is_displaced() {
         let mut progress = Progress::new(2);
         let mut see = |x_m: f64, n: usize| {
-            for turn in 0..n {
-                let placed = DVec3::Y * turn as f64;
+            for step in 0..n {
+                let placed = DVec3::Y * step as f64;
                 progress.see(&[DVec3::X * x_m, placed], &[true, false]);
             }
             progress.is_idle()

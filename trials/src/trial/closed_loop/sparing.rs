@@ -1,6 +1,6 @@
 //! Steps of a policy that would push objects where hands can neither grasp them nor push them back.
 //!
-//! A hand that misses its object pushes it ahead, and so does one whose way leads past the other arm's object.
+//! A hand that misses its object pushes it ahead, and so does one whose path leads past the other arm's object.
 
 use glam::DVec3;
 use tandem_core::ArmIndex;
@@ -10,25 +10,25 @@ use crate::trial::mapping::ArmObservation;
 use crate::trial::runner::TrialRunner;
 
 /// An object within this horizontal distance of a hand is between its pads, metres.
-pub(super) const BETWEEN_M: f64 = 0.012;
+pub(super) const BETWEEN_PADS_DISTANCE_M: f64 = 0.012;
 /// The centre of a held object is within this horizontal distance of the hand, metres.
-pub(super) const HELD_M: f64 = 0.02;
+pub(super) const HELD_DISTANCE_M: f64 = 0.02;
 /// Distance from a hand to the centre of the object that it pushes ahead, metres.
-pub(super) const AHEAD_M: f64 = 0.045;
+pub(super) const PUSHING_DISTANCE_M: f64 = 0.045;
 /// Distance from the inner side of a pad to its middle, metres.
-const PAD_M: f64 = 0.005;
+const PAD_HALF_THICKNESS_M: f64 = 0.005;
 /// Distance by which a step has to bring an object farther out of reach to count, metres.
-const BEYOND_M: f64 = 0.001;
-/// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects may end
-/// up side by side at the edge of the table's area.
-const MOVED_M: f64 = 0.02;
+const REACH_EXCESS_M: f64 = 0.001;
+/// A hand that grasps does not push the object of another arm farther than this in one step, metres. The two objects
+/// may end up side by side at the edge of the table's area.
+const MAX_PUSH_M: f64 = 0.02;
 /// Height by which a hand rises instead of pushing its object out of reach, metres.
 const RISE_M: f64 = 0.06;
 
 impl TrialRunner {
-    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm, or that grasp and
-    /// would push the other arm's object: they rise. Grippers that grasp also [open and close when and where they
-    /// should](Self::prepare_grasp).
+    /// Replaces what the policy wants of hands that would push an object out of the reach of that object's arm, or that
+    /// grasp and would push the other arm's object: they rise. Grippers that grasp also [open and close when and where
+    /// they should](Self::prepare_grasp).
     pub(super) fn spare_objects(
         &self,
         state: &mut LoopState,
@@ -54,31 +54,32 @@ impl TrialRunner {
         }
     }
 
-    /// Returns whether a hand that moves `to` (own frame, metres) would push its object to where no hand can follow. A
-    /// policy that pushes may do so toward the object's `goal`, own frame, metres.
+    /// Returns whether a hand that moves `to` (arm frame, metres) would push its object to where no hand can follow. A
+    /// policy that pushes may do so toward the object's `goal`, arm frame, metres.
     fn pushes_out_of_reach(&self, now: &ArmObservation, to: DVec3, goal: DVec3) -> bool {
         let top_m = now.object.z + self.config.trained_half_m;
         let to_object = (now.object - now.hand).truncate();
-        let way = (to - now.hand).truncate();
+        let displacement = (to - now.hand).truncate();
         if now.hand.z.min(to.z) >= top_m
-            || to_object.length() < BETWEEN_M
-            || way.dot(to_object) <= 0.0
+            || to_object.length() < BETWEEN_PADS_DISTANCE_M
+            || displacement.dot(to_object) <= 0.0
         {
             return false;
         }
         let to_goal = (goal - now.object).truncate();
-        if !self.config.layout.task.grasps() && (to_goal - way).length() < to_goal.length() {
+        if !self.config.layout.task.grasps() && (to_goal - displacement).length() < to_goal.length()
+        {
             return false;
         }
-        let ahead = (to_object.normalize() * (AHEAD_M + self.behind_m())).extend(0.0);
+        let ahead = (to_object.normalize() * (PUSHING_DISTANCE_M + self.behind_m())).extend(0.0);
         let beyond =
             |hand: DVec3| beyond_m(hand + ahead, self.mapping.reachable_hand(hand + ahead));
-        beyond(to) > beyond(now.hand) + BEYOND_M
+        beyond(to) > beyond(now.hand) + REACH_EXCESS_M
     }
 
-    /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of the
-    /// other arm where it [should not](Self::disturbs) if it moves `to`, own frame of the first arm, metres. `across` is the
-    /// direction across the closing direction of its gripper.
+    /// Returns whether the hand of the first arm, a pad of its open gripper or what it holds would push the object of
+    /// the other arm where it [should not](Self::disturbs) if it moves `to`, frame of the first arm, metres. `across`
+    /// is the direction across the closing direction of its gripper.
     fn pushes_from_its_arm(
         &self,
         arms: [usize; 2],
@@ -88,21 +89,21 @@ impl TrialRunner {
     ) -> bool {
         let now = &seen[arms[0]];
         let half_m = self.config.trained_half_m;
-        if (now.object - now.hand).length() < HELD_M {
+        if (now.object - now.hand).length() < HELD_DISTANCE_M {
             let lowest = DVec3::NEG_Z * half_m;
-            let way = [now.hand, to].map(|hand| hand + lowest);
-            return self.disturbs(arms, seen, way, 2.0 * half_m);
+            let path = [now.hand, to].map(|hand| hand + lowest);
+            return self.disturbs(arms, seen, path, 2.0 * half_m);
         }
-        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_M);
+        let pad = DVec3::new(-across.y, across.x, 0.0) * (now.opening_m + PAD_HALF_THICKNESS_M);
         let pads = if self.config.layout.task.grasps() { vec![pad, -pad] } else { Vec::new() };
         std::iter::once(DVec3::ZERO)
             .chain(pads)
-            .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], AHEAD_M))
+            .any(|part| self.disturbs(arms, seen, [now.hand + part, to + part], PUSHING_DISTANCE_M))
     }
 
-    /// Returns whether something of the first arm that moves between two positions, own frame, metres, with objects
+    /// Returns whether something of the first arm that moves between two positions, arm frame, metres, with objects
     /// `ahead_m` metres ahead of it, would push the object of the other arm to where that arm's hand cannot follow. A
-    /// gripper that grasps should not push it [at all](MOVED_M) either.
+    /// gripper that grasps should not push it [at all](MAX_PUSH_M) either.
     fn disturbs(
         &self,
         [arm, other]: [usize; 2],
@@ -112,41 +113,43 @@ impl TrialRunner {
     ) -> bool {
         let others = seen[other].object;
         let object = self.mapping.object_in_world(ArmIndex(other), others);
-        let object = self.mapping.object_in_own(ArmIndex(arm), object);
+        let object = self.mapping.object_in_arm(ArmIndex(arm), object);
         let lowest_m = from.z.min(to.z);
         let half_m = self.config.trained_half_m;
         let to_object = (object - from).truncate();
-        let way = (to - from).truncate();
-        let aside_m = way.normalize_or_zero().perp_dot(to_object).abs();
+        let displacement = (to - from).truncate();
+        let aside_m = displacement.normalize_or_zero().perp_dot(to_object).abs();
         let gap_m = to_object.length() - ahead_m;
         if lowest_m >= object.z + half_m
-            || way.dot(to_object) <= 0.0
+            || displacement.dot(to_object) <= 0.0
             || aside_m > ahead_m
-            || gap_m > way.length()
+            || gap_m > displacement.length()
         {
             return false;
         }
-        let moved = (way - way.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
-        if self.config.layout.task.grasps() && moved.length() > MOVED_M {
+        let moved = (displacement - displacement.normalize_or_zero() * gap_m.max(0.0)).extend(0.0);
+        if self.config.layout.task.grasps() && moved.length() > MAX_PUSH_M {
             return true;
         }
         let then = self.mapping.object_in_world(ArmIndex(arm), object + moved);
-        let then = self.mapping.object_in_own(ArmIndex(other), then);
+        let then = self.mapping.object_in_arm(ArmIndex(other), then);
         let behind = (then - others).normalize_or_zero() * self.behind_m();
-        let beyond = |at: DVec3| beyond_m(at + behind, self.mapping.reachable_hand(at + behind));
-        beyond(then) > beyond(others) + BEYOND_M
+        let beyond = |position: DVec3| {
+            beyond_m(position + behind, self.mapping.reachable_hand(position + behind))
+        };
+        beyond(then) > beyond(others) + REACH_EXCESS_M
     }
 
     /// Distance behind an object at which a hand has to be to bring the object back, metres: a policy that pushes gets
     /// behind it, one that grasps goes to it.
     fn behind_m(&self) -> f64 {
-        if self.config.layout.task.grasps() { 0.0 } else { AHEAD_M }
+        if self.config.layout.task.grasps() { 0.0 } else { PUSHING_DISTANCE_M }
     }
 }
 
-/// Returns by how far `at` is beyond what hands reach according to `reachable`, horizontally, metres.
-fn beyond_m(at: DVec3, reachable: DVec3) -> f64 {
-    (at - reachable).truncate().length()
+/// Returns by how far `position` is beyond what hands reach according to `reachable`, horizontally, metres.
+fn beyond_m(position: DVec3, reachable: DVec3) -> f64 {
+    (position - reachable).truncate().length()
 }
 
 #[cfg(test)]
@@ -163,7 +166,7 @@ pub(super) mod tests {
             hand_velocity: DVec3::ZERO,
             opening_m: 0.05,
             object,
-            turn: DQuat::IDENTITY,
+            orientation: DQuat::IDENTITY,
         }
     }
 
@@ -179,8 +182,8 @@ pub(super) mod tests {
     fn spared_toward(goal: DVec3, task: Task, now: ArmObservation, to: DVec3) -> (DVec3, f64) {
         let mut runner = runner(task);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         state.openings_m = vec![0.05; 2];
         let mut wanted = WantedStep { hands: vec![to; 2], openings_m: vec![0.03; 2], blocks: &[] };
         runner.spare_objects(&mut state, &[now, now], &[goal; 2], &mut wanted);
@@ -193,15 +196,15 @@ pub(super) mod tests {
         let pushed = |task, above_m: f64| {
             let mut runner = runner(task);
             let start = runner.start(0).unwrap();
-            let at = runner.mapping.cell().ready(0.2).unwrap();
-            let mut state = LoopState::new(&start, &at);
+            let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+            let mut state = LoopState::new(&start, &joint_angles);
             let across = runner.across(0, &state);
             let pad = DVec3::new(-across.y, across.x, 0.0) * 0.055;
             let hand = DVec3::new(0.1, 0.0, 0.03 + above_m);
             // In front of one of the pads.
             let object = (hand + across * 0.06 + pad).with_z(0.03);
             let others = runner.mapping.object_in_world(ArmIndex(0), object);
-            let others = runner.mapping.object_in_own(ArmIndex(1), others);
+            let others = runner.mapping.object_in_arm(ArmIndex(1), others);
             let now =
                 [seen(hand, hand - DVec3::X * 0.3), seen(DVec3::new(0.0, -0.15, 0.2), others)];
             let to = hand + across * 0.04;
@@ -219,12 +222,12 @@ pub(super) mod tests {
     fn a_hand_rises_instead_of_pushing_an_object_out_of_its_arms_reach() {
         let mut runner = runner(Task::SharedPickAndPlace);
         let start = runner.start(0).unwrap();
-        let at = runner.mapping.cell().ready(0.2).unwrap();
-        let mut state = LoopState::new(&start, &at);
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
         // As far from the second arm as its hand reaches, seen from the first arm, toward whose base the hand moves.
         let farthest = runner.mapping.reachable_hand(DVec3::new(1.0, 0.0, 0.03));
         let in_world = runner.mapping.object_in_world(ArmIndex(1), farthest);
-        let seen_by_first = runner.mapping.object_in_own(ArmIndex(0), in_world);
+        let seen_by_first = runner.mapping.object_in_arm(ArmIndex(0), in_world);
         let hand = seen_by_first + DVec3::X * 0.05;
         let away = DVec3::new(0.1, 0.15, 0.03);
         let mut moved = |to: DVec3| {

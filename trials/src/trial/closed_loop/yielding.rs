@@ -6,57 +6,52 @@
 use glam::{DQuat, DVec3};
 use tandem_kinematics::Waypoint;
 
-use super::{LoopState, WantedStep};
+use super::{ClosedLoop, WantedStep};
 use crate::trial::block_avoidance::ObservedBlock;
 use crate::trial::outcome::FailureCause;
-use crate::trial::rig::TrialRig;
-use crate::trial::runner::TrialRunner;
 
 /// The force from which a hand withdraws, newtons, and the distance by which it does, metres.
-const PRESSING_N: f64 = 3.0;
-const WITHDRAW_M: f64 = 0.006;
+const PRESSING_FORCE_N: f64 = 3.0;
+const WITHDRAWAL_M: f64 = 0.006;
 /// By how much a gripper that holds something is further open than commanded, metres on each side.
-const GRIPPED_M: f64 = 0.002;
+const GRIP_EXCESS_M: f64 = 0.002;
 
-impl TrialRunner {
+impl ClosedLoop<'_, '_> {
     /// Continues from where the arms stopped on their way from `first`.
-    pub(super) fn yielded(&self, rig: &TrialRig<'_>, state: &mut LoopState, first: Waypoint) {
-        let forces_n = rig.forces_n();
-        for (arm, (angles, opening)) in rig.encoders().into_iter().enumerate() {
-            state.at[arm] = angles;
-            let opening_m = self.mapping.opening_in_own(opening);
+    pub(super) fn yielded(&mut self, first: Waypoint) {
+        let (mapping, state) = (&self.runner.mapping, &mut self.state);
+        let forces_n = self.rig.forces_n();
+        for (arm, (angles, opening)) in self.rig.encoders().into_iter().enumerate() {
+            state.joint_angles[arm] = angles;
+            let opening_m = mapping.policy_opening_m(opening);
             // A gripper that holds something keeps its grip, unless its hand presses on something.
-            let grips = state.openings_m[arm] < opening_m - GRIPPED_M;
-            if !grips || forces_n[arm].length() >= PRESSING_N {
+            let grips = state.openings_m[arm] < opening_m - GRIP_EXCESS_M;
+            if !grips || forces_n[arm].length() >= PRESSING_FORCE_N {
                 state.openings_m[arm] = opening_m;
             }
         }
         let withdraw = forces_n.into_iter().enumerate().map(|(arm, force_n)| {
-            if force_n.length() < PRESSING_N {
+            if force_n.length() < PRESSING_FORCE_N {
                 return DVec3::ZERO;
             }
-            let yaw_rad = self.mapping.cell().arms[arm].yaw_rad;
-            DQuat::from_rotation_z(-yaw_rad) * (force_n.normalize() * WITHDRAW_M)
+            let yaw_rad = mapping.cell().arms[arm].yaw_rad;
+            DQuat::from_rotation_z(-yaw_rad) * (force_n.normalize() * WITHDRAWAL_M)
         });
         state.withdraw = Some(withdraw.collect());
-        let reached = self.tools(state);
+        let reached = self.runner.tools(state);
         let [rise, corner, end] = std::array::from_fn(|_| reached.clone());
         state.append_waypoints([first, rise, corner, end, reached]);
     }
 
     /// Withdraws the hands that pressed on something in the step before. Returns whether there were any.
-    pub(super) fn withdraw(
-        &self,
-        rig: &mut TrialRig<'_>,
-        state: &mut LoopState,
-        blocks: &[ObservedBlock],
-    ) -> Result<bool, FailureCause> {
-        let Some(withdraw) = state.withdraw.take() else { return Ok(false) };
-        let hands = self.hands(state).iter().zip(withdraw).map(|(hand, by)| hand + by).collect();
-        let wanted = WantedStep { hands, openings_m: state.openings_m.clone(), blocks };
-        self.attempt(rig, state, &wanted, &wanted.hands, &self.check)?;
+    pub(super) fn withdraw(&mut self, blocks: &[ObservedBlock]) -> Result<bool, FailureCause> {
+        let Some(withdraw) = self.state.withdraw.take() else { return Ok(false) };
+        let hands = self.runner.hands(&self.state);
+        let hands = hands.iter().zip(withdraw).map(|(hand, by)| hand + by).collect();
+        let wanted = WantedStep { hands, openings_m: self.state.openings_m.clone(), blocks };
+        self.attempt(&wanted, &wanted.hands, &self.runner.check)?;
         // A withdrawal that meets something itself is not followed by another.
-        state.withdraw = None;
+        self.state.withdraw = None;
         Ok(true)
     }
 }
