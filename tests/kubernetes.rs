@@ -10,7 +10,7 @@ mod cluster;
 #[path = "kubernetes/manifests.rs"]
 mod manifests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::process::{Command, Stdio};
 
 use tandem_proto::pb;
@@ -42,6 +42,13 @@ fn small(run: &str) -> String {
     change("checkpoint", "every_rounds", Value::Integer(1));
     change("stop", "max_env_steps", Value::Integer(ENV_STEPS));
     toml::to_string(&run).expect("TOML")
+}
+
+/// Returns the manifests of a training run with a small run.
+fn small_base() -> Manifests {
+    let mut manifests = Manifests::of_base();
+    manifests.settings.text = small(&manifests.settings.text);
+    manifests
 }
 
 /// Returns true if Redis is installed.
@@ -96,10 +103,9 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
         println!("SKIPPED: redis-server is not installed");
         return;
     }
-    let manifests = Manifests::read();
-    let run = small(&manifests.run);
+    let manifests = small_base();
     let workloads = manifests.workloads.clone();
-    let mut cluster = Cluster::new(manifests, run);
+    let mut cluster = Cluster::new(manifests);
     let mut names = Vec::new();
     for (name, workload) in &workloads {
         names.extend(cluster.add(name, workload.replicas));
@@ -157,9 +163,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
 
 #[test]
 fn a_misspelt_argument_in_a_manifest_is_detected() {
-    let manifests = Manifests::read();
-    let run = small(&manifests.run);
-    let mut cluster = Cluster::new(manifests, run);
+    let mut cluster = Cluster::new(small_base());
     for name in ["redis", "teacher", "learner", "bridge", "worker"] {
         cluster.add(name, 1);
     }
@@ -174,4 +178,29 @@ fn a_misspelt_argument_in_a_manifest_is_detected() {
             assert!(stderr.contains(&misspelt), "{misspelt}: {stderr}");
         }
     }
+}
+
+#[test]
+fn each_pod_of_the_sweep_plans_a_run_of_its_own() {
+    let manifests = Manifests::of_sweep();
+    let completions = manifests.workloads["sweep"].completions.expect("an Indexed Job");
+    let mut cluster = Cluster::new(manifests);
+    // One more than the Job has: its index must be out of range.
+    let mut pods = cluster.add("sweep", completions + 1);
+    let surplus = pods.pop().expect("a pod");
+    let mut planned = BTreeSet::new();
+    for (idx, pod) in pods.iter().enumerate() {
+        let output = cluster.run_with(pod, &["--dry-run", "--json"]);
+        assert!(output.status.success(), "{pod}: {}", String::from_utf8_lossy(&output.stderr));
+        let plan: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let runs = plan["runs"].as_array().expect("a list");
+        assert_eq!(runs.len(), 1, "{pod}: {plan}");
+        assert_eq!(runs[0]["index"], idx, "{pod}: {plan}");
+        planned.insert(runs[0]["name"].as_str().expect("a name").to_owned());
+    }
+    assert_eq!(planned.len(), pods.len(), "{planned:?}");
+    let output = cluster.run_with(&surplus, &["--dry-run"]);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(64), "{stderr}");
+    assert!(stderr.contains(&format!("--only {completions}")), "{stderr}");
 }
