@@ -339,8 +339,11 @@ def check_schemas(folder):
             for version in VERSIONS:
                 # Without YAML aliases and tuples, as an API server receives it.
                 kubernetes_validate.validate(json.loads(json.dumps(found)), version, strict=True)
-        how = "as kustomize builds them" if others is not None else "kustomize is not installed"
-        print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}, {how}")
+        how = ", as kustomize builds them" if others is not None else ""
+        print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}{how}")
+    if not any(map(shutil.which, ("kustomize", "kubectl"))):
+        text = "manifests as kustomize builds them: neither kustomize nor kubectl is installed"
+        subprocess.run([ROOT / "scripts/skip", "KUSTOMIZE", text], check=True)
 
 
 # Mistakes that no schema detects.
