@@ -20,10 +20,15 @@ fn main() {
 
 /// The files and folders that the program is compiled from.
 fn sources() -> Vec<PathBuf> {
-    let folders = std::fs::read_dir(".").into_iter().flatten().flatten();
-    let crates = folders.map(|folder| folder.path().join("src")).filter(|path| path.is_dir());
-    let files = ["src", "Cargo.toml", "Cargo.lock", "build.rs"].map(PathBuf::from);
-    files.into_iter().chain(crates).collect()
+    let folders = std::fs::read_dir(".").into_iter().flatten().flatten().map(|entry| entry.path());
+    // A folder with a lock file is a workspace of its own, which the program does not contain.
+    let crates = folders.filter(|folder| !folder.join("Cargo.lock").exists());
+    let parts = ["Cargo.toml", "build.rs", "src", "assets", "proto"];
+    let of_crates = crates
+        .filter(|folder| folder.join("Cargo.toml").exists())
+        .flat_map(|folder| parts.map(|part| folder.join(part)));
+    let of_root = ["src", "Cargo.toml", "Cargo.lock", "build.rs"].map(PathBuf::from);
+    of_root.into_iter().chain(of_crates.filter(|path| path.exists())).collect()
 }
 
 /// Runs this script again after a commit and after an edit of the sources.

@@ -21,8 +21,8 @@ SECRETS = {"tandem-secrets": {"token", "redis-password"}}
 # A pod that someone else starts to call the services that it may call, see deploy/kubernetes/base/network.yaml.
 OPERATOR = {"metadata": {"name": "operator"}, "spec": {"template": {"metadata": {"labels": {"tandem-operator": "true"}}}}}
 OPERATOR_CALLS = [("learner", 7000), ("bridge", 7002)]
-# gRPC probes are stable since 1.27.
-VERSIONS = ("1.27.0", "1.37.0")
+# Limits of failures per index of a Job are enabled since 1.29.
+VERSIONS = ("1.29.0", "1.37.0")
 
 
 # Kustomizations, limited to the features used here. If kubectl or kustomize is installed, its output must be the same.
@@ -181,7 +181,7 @@ class Checked:
         self.expect(("FailJob", 64) in codes, f"{name}: a wrong setting is tried again")
         named = {rule["onExitCodes"]["containerName"] for rule in rules if "onExitCodes" in rule}
         self.expect(named == {container["name"] for container in containers(job)}, f"{name}: a rule is about no container")
-        ignored = [condition["type"] for rule in rules if rule["action"] == "Ignore" for condition in rule["onPodConditions"]]
+        ignored = [condition["type"] for rule in rules if rule["action"] == "Ignore" for condition in rule.get("onPodConditions", [])]
         self.expect(ignored == ["DisruptionTarget"], f"{name}: evicted pods count as failures")
         if ("ConfigMap", "tandem-sweep") in self.objects:
             self.check_sweep(job)
@@ -203,6 +203,8 @@ class Checked:
             (values,) = axis.values()
             n_runs *= len(values)
         self.expect(spec["completionMode"] == "Indexed", f"{name}: its pods have no index")
+        is_per_run = "backoffLimitPerIndex" in spec and not {"backoffLimit", "maxFailedIndexes"} & spec.keys()
+        self.expect(is_per_run, f"{name}: a run that fails ends the others")
         self.expect(spec["completions"] == n_runs, f"{name}: {spec['completions']} completions, {n_runs} runs")
         fields = [env.get("valueFrom", {}).get("fieldRef", {}).get("fieldPath") for container in containers(job) for env in container["env"]]
         self.expect("metadata.annotations['batch.kubernetes.io/job-completion-index']" in fields, f"{name}: no pod knows its index")
@@ -301,8 +303,9 @@ def check_files(folder):
         command = re.search(rf"create secret generic {secret}[^`]*", manual)
         problems += [f"docs/cluster.md makes no {secret} with {key}" for key in keys if not command or f"={key}" not in command[0]]
     version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
-    tag = documents(folder / "base/kustomization.yaml")[0]["images"][0]["newTag"]
-    problems += [f"the image is of version {tag}, the program of {version}"] if tag != version else []
+    for file in sorted(folder.rglob("kustomization.yaml")):
+        tags = {image["newTag"] for image in documents(file)[0].get("images", [])}
+        problems += [f"{file.parent.name}: the image is of version {tag}, the program of {version}" for tag in tags - {version}]
     run = tomllib.loads((folder / "base/run.toml").read_text())
     policies = re.findall(r"/usr/share/tandem/(\S+)", (folder / "base/teacher.yaml").read_text())
     problems += [f"{policy} does not ship" for policy in policies if not (ROOT / policy).is_file()]
@@ -336,8 +339,11 @@ def check_schemas(folder):
             for version in VERSIONS:
                 # Without YAML aliases and tuples, as an API server receives it.
                 kubernetes_validate.validate(json.loads(json.dumps(found)), version, strict=True)
-        how = "as kustomize builds them" if others is not None else "kustomize is not installed"
-        print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}, {how}")
+        how = ", as kustomize builds them" if others is not None else ""
+        print(f"{overlay.name}: {len(objects)} objects fit the schemas of Kubernetes {' and '.join(VERSIONS)}{how}")
+    if not any(map(shutil.which, ("kustomize", "kubectl"))):
+        text = "manifests as kustomize builds them: neither kustomize nor kubectl is installed"
+        subprocess.run([ROOT / "scripts/skip", "KUSTOMIZE", text], check=True)
 
 
 # Mistakes that no schema detects.
@@ -364,6 +370,8 @@ MISTAKES = [
     ("base/kustomization.yaml", "newTag: 0.1.0", "newTag: 0.0.9"),
     ("base/kustomization.yaml", "  - redis.yaml\n", ""),
     ("base/run.toml", "slots = 16", "slots = 4"),
+    ("sweep/kustomization.yaml", "newTag: 0.1.0", "newTag: 0.0.9"),
+    ("sweep/sweep.yaml", "backoffLimitPerIndex: 10", "backoffLimit: 10"),
     ("sweep/sweep.toml", "seeds = [1, 2, 3]", "seeds = [1, 2]"),
     ("sweep/sweep.yaml", "completionMode: Indexed", "completionMode: NonIndexed"),
     ("sweep/sweep.yaml", "job-completion-index", "completion-index"),

@@ -78,7 +78,10 @@ for file in policies/*.safetensors; do
   "$work/venv/bin/python" scripts/check_onnx.py "$file" "$work/actor.onnx" "$work/critic.onnx" "$work/probe.json" "$work/$name"
   "$tandem" policy import "$work/actor.onnx" --critic "$work/critic.onnx" --out "$work/back.safetensors" >/dev/null
   digest() { "$tandem" policy show "$1" --json | python3 -c 'import json, sys; print(json.load(sys.stdin)["digest"])'; }
-  [ "$(digest "$file")" = "$(digest "$work/back.safetensors")" ] || { echo "$name changed by export and import"; exit 1; }
+  # Assigned first, because a command that fails inside of a comparison does not end the script.
+  exported=$(digest "$file")
+  imported=$(digest "$work/back.safetensors")
+  [ "$exported" = "$imported" ] || { echo "$name changed by export and import"; exit 1; }
 done
 for log in "$work"/run/mcap/*.mcap; do "$tandem" replay "$log" --verify >/dev/null; done
 
@@ -86,6 +89,7 @@ echo '- policies push and carry a bar in another physics engine'
 "$work/venv/bin/pip" install --quiet --requirement scripts/requirements-mujoco.txt
 "$work/venv/bin/python" scripts/mujoco_transfer.py policies/teacher-push.safetensors \
   policies/teacher-push-classic.safetensors policies/student-carry-bar.safetensors --episodes 4 --json \
+  --tandem "$tandem" \
   >"$work/transfer.json"
 python3 - "$work/transfer.json" <<'PY'
 import json, sys

@@ -127,7 +127,11 @@ fn selected(mut runs: Vec<PlannedRun>, only: usize) -> Result<PlannedRun, Failed
 fn lock(out: &Path, is_shared: bool) -> anyhow::Result<File> {
     std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let path = out.join("sweep.lock");
-    let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+    // NFS grants a shared lock only to a file that is open for reading, and an exclusive one only to a file that is open
+    // for writing.
+    let mut options = File::options();
+    let opened = options.read(true).write(true).create(true).truncate(false).open(&path);
+    let file = opened.with_context(|| format!("cannot write {}", path.display()))?;
     let locked = if is_shared { file.try_lock_shared() } else { file.try_lock() };
     match locked {
         Ok(()) => Ok(file),
@@ -465,4 +469,21 @@ fn print_resume_command(args: &SweepArgs, out: &Path, end: SweepEnd) {
         shell_word(&args.file),
         shell_word(out)
     ));
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read as _, Write as _};
+
+    use super::*;
+
+    #[test]
+    fn the_lock_file_is_open_for_reading_and_for_writing() {
+        let keep = tempfile::tempdir().expect("a directory");
+        for is_shared in [false, true] {
+            let mut file = lock(keep.path(), is_shared).expect("free");
+            assert_eq!(file.read(&mut [0]).expect("readable"), 0);
+            assert_eq!(file.write(&[]).expect("writable"), 0);
+        }
+    }
 }

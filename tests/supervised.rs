@@ -1,5 +1,6 @@
 //! Services under a supervisor that restarts the same command.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -91,6 +92,36 @@ impl Supervised {
             row
         };
         text.lines().map(row).collect()
+    }
+
+    /// Returns the contents of the run's files by path.
+    fn files(&self) -> BTreeMap<PathBuf, Vec<u8>> {
+        let mut files = BTreeMap::new();
+        let mut directories = vec![self.out()];
+        while let Some(directory) = directories.pop() {
+            for entry in fs::read_dir(directory).expect("a directory").flatten() {
+                let path = entry.path();
+                if path.is_dir() {
+                    directories.push(path);
+                } else {
+                    let content = fs::read(&path).expect("readable");
+                    files.insert(path, content);
+                }
+            }
+        }
+        files
+    }
+
+    /// Starts a learner as for a new run, and returns its exit code and its log.
+    fn start_over(&self) -> (Option<i32>, String) {
+        let mut command = tandem(&["learner", "--listen", "127.0.0.1:0", "--run"]);
+        command.arg(self.directory.path().join("run.toml")).arg("--out").arg(self.out());
+        let log = self.directory.path().join("start-over.log");
+        log_to(&mut command, &log);
+        let mut process = command.spawn().expect("starts");
+        let ended = end_of(&mut process);
+        drop((process.kill(), process.wait()));
+        (ended.and_then(|ended| ended.code()), fs::read_to_string(log).expect("a log"))
     }
 
     /// Returns the logs of all processes.
@@ -198,11 +229,20 @@ fn the_same_command_starts_and_resumes_a_run() {
     assert_eq!(run.metrics(), undisturbed.metrics());
     let kept = fs::read_to_string(run.out().join("run.toml")).expect("the settings are kept");
     assert!(kept.contains("name = \"supervised\"") && kept.contains("[replay]"), "{kept}");
+
+    // Without --resume or --start-or-resume, a learner does not overwrite the run.
+    let before = run.files();
+    let (code, log) = run.start_over();
+    assert_eq!(code, Some(64), "{log}");
+    assert!(log.contains("holds a run already"), "{log}");
+    assert!(run.files() == before, "the files of the run have changed");
 }
 
 #[test]
-fn an_existing_run_is_not_overwritten() {
+fn resuming_a_run_and_starting_or_resuming_it_exclude_each_other() {
     let both = tandem(&["learner", "--run", "r", "--out", "o", "--resume", "--start-or-resume"]);
     let refused = { both }.output().expect("runs");
-    assert_eq!(refused.status.code(), Some(64), "{}", String::from_utf8_lossy(&refused.stderr));
+    let stderr = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(64), "{stderr}");
+    assert!(stderr.contains("cannot be used with"), "{stderr}");
 }

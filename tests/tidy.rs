@@ -17,7 +17,7 @@ const ALLOWED: [(&str, &[&str]); 20] = [
     ("rl", &["core", "policy"]),
     ("onnx", &["core", "policy"]),
     ("learner", &["core", "system", "policy", "rl", "proto", "telemetry", "net"]),
-    ("teacher", &["core", "policy", "proto", "telemetry", "net", "onnx"]),
+    ("teacher", &["core", "policy", "proto", "net", "onnx"]),
     ("worker", &["core", "sim", "policy", "proto", "telemetry", "net"]),
     ("environment", &["core", "sim", "proto", "net"]),
     ("report", &["core", "system", "telemetry"]),
@@ -80,6 +80,36 @@ fn crates_depend_only_downward() {
 }
 
 #[test]
+fn every_dependency_is_used() {
+    let crates = ALLOWED.into_iter().chain([PYTHON, DEMO]).map(|(name, _)| name).chain(["."]);
+    for name in crates {
+        let sources = rust_files(&root().join(name).join("src"));
+        let programs: Vec<String> =
+            sources.iter().filter(|path| !is_of_tests(path)).map(|path| code_of(path)).collect();
+        for dependency in dependencies(name) {
+            let prefix = format!("{}::", dependency.replace('-', "_"));
+            let is_used = programs.iter().any(|program| !names_after(program, &prefix).is_empty());
+            assert!(is_used, "{name} depends on {dependency}, which it does not use");
+        }
+    }
+}
+
+/// Cargo compiles the tests of examples, and does not run them.
+#[test]
+fn every_test_of_an_example_is_run() {
+    let read = |path: &PathBuf| fs::read_to_string(path).expect("readable");
+    let tests: Vec<String> = rust_files(&root().join("tests")).iter().map(read).collect();
+    let crates = ALLOWED.iter().map(|(name, _)| root().join(name)).chain([root().to_owned()]);
+    let examples = crates.map(|path| path.join("examples")).filter(|path| path.is_dir());
+    for example in examples.flat_map(|path| rust_files(&path)) {
+        let path = example.strip_prefix(root()).expect("below").display().to_string();
+        let is_included = tests.iter().any(|test| test.contains(&format!("/{path}\"")));
+        let has_tests = read(&example).contains("#[test]");
+        assert!(is_included || !has_tests, "no file in tests/ includes {path}, which has tests");
+    }
+}
+
+#[test]
 fn pure_modules_name_no_runtime() {
     for path in PURE.iter().flat_map(|path| rust_files(&root().join(path))) {
         let text = fs::read_to_string(&path).expect("readable");
@@ -98,9 +128,8 @@ fn one_module_prints() {
     let dirs =
         ALLOWED.iter().map(|(name, _)| root().join(name).join("src")).chain([root().join("src")]);
     let printer = root().join("src/output.rs");
-    let is_test = |path: &Path| path.iter().any(|part| part == "tests");
     let files = dirs.flat_map(|dir| rust_files(&dir));
-    for path in files.filter(|path| *path != printer && !is_test(path)) {
+    for path in files.filter(|path| *path != printer && !is_of_tests(path)) {
         let text = fs::read_to_string(&path).expect("readable");
         let program = without_tests(&text);
         for word in ["print!(", "println!(", "stdout()", "stderr().lock()"] {
@@ -273,12 +302,9 @@ fn module_uses(directory: &Path) -> BTreeMap<String, BTreeSet<String>> {
         let files = [directory.join(format!("{module}.rs")), directory.join(module)];
         let mut used = BTreeSet::new();
         let sources = files.iter().filter(|path| path.exists()).flat_map(|path| rust_files(path));
-        for path in sources.filter(|path| !path.ends_with("tests.rs")) {
+        for path in sources.filter(|path| !is_of_tests(path)) {
             let depth = path.strip_prefix(directory).expect("below").components().count();
-            let text = fs::read_to_string(&path).expect("readable");
-            let program = without_tests(&text);
-            let is_code = |line: &&str| !line.trim_start().starts_with("//");
-            let program = program.lines().filter(is_code).collect::<Vec<_>>().join("\n");
+            let program = code_of(&path);
             let from_root = "super::".repeat(depth);
             for prefix in ["crate::", from_root.as_str()] {
                 used.extend(names_after(&program, prefix));
@@ -292,6 +318,19 @@ fn module_uses(directory: &Path) -> BTreeMap<String, BTreeSet<String>> {
         uses.insert(module.clone(), used);
     }
     uses
+}
+
+/// Returns whether a file consists of unit tests.
+fn is_of_tests(path: &Path) -> bool {
+    let below = path.strip_prefix(root()).expect("below");
+    below.iter().any(|part| part == "tests" || part == "tests.rs")
+}
+
+/// Returns the lines of a file that are neither comments nor unit tests.
+fn code_of(path: &Path) -> String {
+    let program = without_tests(&fs::read_to_string(path).expect("readable"));
+    let is_code = |line: &&str| !line.trim_start().starts_with("//");
+    program.lines().filter(is_code).collect::<Vec<_>>().join("\n")
 }
 
 /// Returns what precedes the unit tests of a file. They may also be declared at its top and lie in a file of their own.

@@ -4,3 +4,5 @@
 mod drivers;
 mod pair;
 mod service;
+#[path = "../../tests/services/skipped.rs"]
+mod skipped;

@@ -4,15 +4,14 @@ import os
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 def main(arguments: list[str]) -> None:
     if arguments[:2] != ["run", "--release"]:
         raise SystemExit(f"cargo {' '.join(arguments)}: only `cargo run --release` is executed")
     passed = arguments[arguments.index("--") + 1 :] if "--" in arguments else []
     if "--example" in arguments:
-        example = ROOT / "target/release/examples" / arguments[arguments.index("--example") + 1]
+        # Cargo puts examples beside the program.
+        example = Path(os.environ["GUIDE_PROGRAM"]).parent / "examples" / arguments[arguments.index("--example") + 1]
         os.execv(example, [str(example), *passed])
     os.execvp("tandem", ["tandem", *passed])
 

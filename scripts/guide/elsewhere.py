@@ -72,7 +72,7 @@ ELSEWHERE = [
     Entry("cargo build", "a step of its own", ".ci/run"),
     Entry("cargo test", "a step of its own", ".ci/run"),
     Entry("cargo mutants", "takes hours", ".cargo/mutants.toml"),
-    Entry("cargo install --path .", "compiles the program again", ""),
+    Entry("cargo install --locked --path .", "compiles the program again", ""),
     Entry("cargo install cargo-mutants", "needs a package registry", ""),
     Entry("scripts/fuzz", "a step of its own", ".ci/run"),
     Entry("fuzz/target/x86_64-unknown-linux-gnu/release/log", "minimises an input that makes a decoder fail", ""),

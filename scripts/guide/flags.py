@@ -19,10 +19,13 @@ class Flags:
         self.program = program
 
     def check(self, command: Command) -> Iterator[str]:
-        """Yields a line for each script, and each subcommand and option of `tandem`, that does not exist."""
+        """Yields a line for each script, and each subcommand and option of `tandem`, that does not exist, and for each
+        `cargo install` that ignores Cargo.lock."""
         for words in simple_commands(command.text):
             if missing := [word for word in words[:2] if word.startswith("scripts/") and not (ROOT / word).exists()]:
                 yield f"{missing[0]} does not exist"
+            if words[:2] == ["cargo", "install"] and "--locked" not in words:
+                yield "`cargo install` ignores Cargo.lock: add --locked"
             if (start := start_of(words)) is not None:
                 yield from self.check_words(words[start + 1 :])
 

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(
     r"(?:^<!-- example: where (?P<where>(?:(?!-->).)*?)\s*-->\n)?^```(?P<label>\S*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL
 )
-INLINE = re.compile(r"(?<!`)`((?:tandem|scripts/|python )[^`]+)`(?!`)")
+INLINE = re.compile(r"(?<!`)`((?:tandem|scripts/|python |cargo install )[^`]+)`(?!`)")
 COMMAND_LABELS = ("", "sh", "console")
 PROMPT = "$ "
 

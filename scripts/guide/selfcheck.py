@@ -54,6 +54,8 @@ def options() -> None:
     assert len(list(flags.check(command("tandem train --sed 1")))) == 1
     assert len(list(flags.check(command("tandem trian")))) == 1
     assert len(list(flags.check(command("scripts/missing --x")))) == 1
+    assert len(list(flags.check(command("cd a && cargo install --path .")))) == 1
+    assert not list(flags.check(command("cargo install --locked --path .")))
 
 
 def links() -> None:

@@ -127,9 +127,10 @@ fn is_incomplete(path: &Path) -> bool {
 
 /// Returns whether a writer holds the lock of an incomplete log.
 fn is_being_written(path: &Path) -> bool {
+    // A shared lock, because NFS refuses an exclusive one to a file that is not open for writing.
     is_incomplete(path)
         && File::open(path)
-            .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+            .is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
 /// Deletes a log, unless another process has done so.

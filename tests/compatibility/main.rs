@@ -6,7 +6,7 @@ mod run;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use serde_json::Value;
+use serde_json::{Value, json};
 use tandem_core::{Layout, Task};
 use tandem_policy::Policy;
 use tandem_report::Run;
@@ -26,8 +26,13 @@ fn versions() -> Vec<PathBuf> {
     versions
 }
 
-fn json(path: &Path) -> Value {
+fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).expect("readable")).expect("JSON")
+}
+
+/// Returns what the files of a version contain.
+fn expected(version: &Path) -> Value {
+    read_json(&version.join("expected.json"))
 }
 
 /// Copies a corpus file that will be opened for writing.
@@ -38,26 +43,15 @@ fn copy(file: &Path) -> (TempDir, PathBuf) {
     (directory, path)
 }
 
-/// The actions of the corpus's policies, observation 0.1 and goal 0.2 throughout, by `scripts/check_policy.py` in double
-/// precision.
-const ACTIONS: [(Task, usize, &[f32]); 4] = [
-    (Task::Push, 1, &[-0.978_658, 1.0, -0.997_690]),
-    (Task::Push, 2, &[0.999_971, 0.999_992, 0.960_273, 0.950_561, -0.999_918, -0.995_930]),
-    (Task::PickAndPlace, 1, &[-0.878_635, 0.999_974, -0.948_191, 0.976_435]),
-    (
-        Task::PickAndPlace,
-        2,
-        &[
-            0.999_996, 0.999_996, 0.015_032, 0.999_542, -0.999_414, -0.998_682, -0.999_683,
-            -0.981_547,
-        ],
-    ),
-];
+/// The policies of a version, by task and number of arms.
+const POLICIES: [(Task, usize); 4] =
+    [(Task::Push, 1), (Task::Push, 2), (Task::PickAndPlace, 1), (Task::PickAndPlace, 2)];
 
 #[test]
 fn policies_are_read() {
     for version in versions() {
-        for (task, n_arms, expected) in ACTIONS {
+        let actions = &expected(&version)["actions"];
+        for (task, n_arms) in POLICIES {
             let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
             let policy = Policy::load(&path).expect("a policy");
             assert_eq!(policy.layout, Layout::new(task, n_arms).into(), "{path:?}");
@@ -66,8 +60,11 @@ fn policies_are_read() {
             let observation = vec![0.1; policy.layout.n_observation()];
             let mut actor = policy.actor().expect("usable");
             actor.act(&observation, &vec![0.2; policy.layout.n_goal()], &mut action);
+            let expected = actions[format!("{task}-{n_arms}")].clone();
+            let expected: Vec<f64> = serde_json::from_value(expected).expect("numbers");
             assert_eq!(action.len(), expected.len(), "{path:?}");
-            let agrees = action.iter().zip(expected).all(|(x, y)| (x - y).abs() < 1e-5);
+            let mut pairs = action.iter().zip(&expected);
+            let agrees = pairs.all(|(x, y)| (f64::from(*x) - y).abs() < 1e-5);
             assert!(agrees, "{path:?} acts {action:?}, not {expected:?}");
         }
     }
@@ -76,34 +73,41 @@ fn policies_are_read() {
 #[test]
 fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
     for version in versions() {
+        let accounts = &expected(&version)["accounts"];
         let (_directory, path) = copy(&version.join("ledger.sqlite"));
         let mut ledger = SqliteLedger::open(&path).expect("a ledger");
-        let mut balance = |name: &str| {
+        for name in ["unleased", "leased"] {
             let balance = ledger.balance(name).expect("an account");
-            (balance.terms.strategy.to_string(), balance.spent, balance.leased, balance.left)
-        };
-        assert_eq!(balance("unleased"), ("mc-q:0.1".to_owned(), 10, 0, 0));
-        assert_eq!(balance("leased"), ("eamc:0.25".to_owned(), 25, 45, 930));
+            let strategy = balance.terms.strategy.to_string();
+            let (spent, leased, left) = (balance.spent, balance.leased, balance.left);
+            let found =
+                json!({ "strategy": strategy, "spent": spent, "leased": leased, "left": left });
+            assert_eq!(found, accounts[name], "{name}");
+        }
         // A charged step is not charged again. The next step is charged to the open lease.
         let charge = |step| Charge { episode: 1, step, wanted_in: BudgetHalves::BOTH };
         let charges = vec![charge(4), charge(5)];
         let request = ChargeRequest { account: "leased".to_owned(), episode_steps: 50, charges };
         ledger.charge(&[request]).remove(0).expect("charged");
         let balance = ledger.balance("leased").expect("an account");
-        assert_eq!((balance.spent, balance.leased, balance.left), (26, 44, 930));
+        let former = |key: &str| accounts["leased"][key].as_u64().expect("units");
+        let charged = (former("spent") + 1, former("leased") - 1, former("left"));
+        assert_eq!((balance.spent, balance.leased, balance.left), charged);
     }
 }
 
 #[test]
 fn an_episode_log_is_read() {
     for version in versions() {
+        let expected = &expected(&version)["episode"];
         let log = read_episode(&version.join("episode.mcap")).expect("an episode");
-        let layout = Layout::new(Task::Push, 2);
-        assert_eq!((&log.metadata.layout, log.metadata.parameter_version), (&layout.into(), 6));
-        assert_eq!(log.metadata.world.get("substeps").map(String::as_str), Some("10"));
-        assert_eq!(log.transitions.len(), 50);
-        assert!(log.transitions.iter().all(|step| step.observation.len() == 56));
-        assert_eq!(log.last_observation.map(|observation| observation.len()), Some(56));
+        assert_eq!(log.metadata.layout, Layout::new(Task::Push, 2).into());
+        assert_eq!(log.metadata.parameter_version, expected["parameter_version"]);
+        assert_eq!(log.metadata.world["substeps"], expected["substeps"]);
+        assert_eq!(log.transitions.len(), expected["n_transitions"]);
+        let n_observation = &expected["n_observation"];
+        assert!(log.transitions.iter().all(|step| step.observation.len() == *n_observation));
+        assert_eq!(log.last_observation.expect("an observation").len(), *n_observation);
     }
 }
 
@@ -124,13 +128,17 @@ fn a_truncated_log_is_recovered() {
 #[test]
 fn trials_are_read() {
     for version in versions() {
+        let expected = &expected(&version)["trial"];
         let rows = read_trials(&version.join("trials.jsonl")).expect("trials");
         let [row] = rows.as_slice() else { panic!("expected one trial, got {}", rows.len()) };
-        assert_eq!((row.mode.as_str(), row.trial, row.success), ("closed-loop", 0, true));
+        assert_eq!(row.trial, 0);
+        assert_eq!(row.mode, expected["mode"]);
+        assert_eq!(row.success, expected["success"]);
         let directory = tempfile::tempdir().expect("a directory");
         let copy = recover(&version.join("trial.mcap"), &directory.path().join("copy.mcap"));
         let copy = copy.expect("readable");
-        assert_eq!((copy.ended_by.as_deref(), copy.metadata_records), (None, 2));
+        assert_eq!(copy.ended_by, None);
+        assert_eq!(copy.metadata_records, expected["metadata_records"]);
     }
 }
 
@@ -141,7 +149,7 @@ fn a_report_is_written_from_a_run_directory() {
         let run = Run::load(&version.join("run"), &mut warnings).expect("a run");
         assert!(warnings.is_empty(), "{warnings:?}");
         let env_steps: Vec<u64> = run.rows.iter().map(|row| row.env_steps).collect();
-        assert_eq!(env_steps, [200, 400, 600]);
+        assert_eq!(json!(env_steps), expected(&version)["run"]["evaluated_env_steps"]);
         assert!(run.configuration.is_some_and(|toml| toml.contains("strategy = \"ea\"")));
     }
 }

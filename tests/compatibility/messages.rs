@@ -1,6 +1,7 @@
 //! Encoded messages: the descriptors still give every field its name, type and value, and the generated types preserve
 //! all fields.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use prost::Message;
@@ -9,7 +10,7 @@ use serde_json::Value;
 use tandem_proto::pb;
 
 fn samples(version: &Path) -> Vec<(String, Vec<u8>, String)> {
-    let samples = super::json(&version.join("messages.json"));
+    let samples = super::read_json(&version.join("messages.json"));
     let text = |sample: &Value, key: &str| sample[key].as_str().expect("a text").to_owned();
     let samples = samples.as_array().expect("a list").iter();
     let read = |it| (text(it, "message"), from_hex(&text(it, "bytes")), text(it, "content"));
@@ -22,6 +23,19 @@ fn from_hex(text: &str) -> Vec<u8> {
         u8::from_str_radix(digits, 16).expect("hexadecimal digits")
     };
     text.as_bytes().chunks(2).map(byte).collect()
+}
+
+/// A version in development may gain message types. The example `sample_files` writes samples of all types.
+#[test]
+fn the_corpus_contains_every_message_type() {
+    let versions = super::versions();
+    let samples = versions.iter().flat_map(|version| samples(version));
+    let known: BTreeSet<String> = samples.map(|(name, ..)| name).collect();
+    let pool = DescriptorPool::decode(tandem_proto::FILE_DESCRIPTOR_SET).expect("descriptors");
+    let messages = pool.all_messages().filter(|message| message.package_name() == "tandem.v1");
+    let names: BTreeSet<String> = messages.map(|message| message.name().to_owned()).collect();
+    let missing: Vec<&String> = names.difference(&known).collect();
+    assert!(!names.is_empty() && missing.is_empty(), "no version has samples of {missing:?}");
 }
 
 #[test]
@@ -54,20 +68,24 @@ fn read_and_write(name: &str, bytes: &[u8]) -> Vec<u8> {
         };
     }
     one_of! {
-        AcceptedMotion, Account, AcquireRequest, AcquireResponse, AdviseRequest, AdviseResponse,
-        ArmAdvice, ArmDescription, ArmMap, ArmMotion, ArmState, ArmWayPoint, BridgeLimits,
-        BridgeStatusRequest, BridgeStatusResponse, BridgeStop, BridgeWayPoint, CheckRequest,
-        CheckResponse, DescribeBridgeRequest, DescribeBridgeResponse, DescribeRequest,
-        DescribeResponse, Episode, EpisodeOrder, Evaluation, ExecuteRequest, ExecuteResponse,
-        ExecuteStart, Exploration, Finished, GetAccountRequest, GetParametersRequest,
-        IndexRange, JoinRequest, JoinResponse, JointDescription, JointMotion, JointSample,
-        Lease, MotionDone, MotionOutcome, MotionProgress, MotionRefusal, MotionRequest,
-        NextWorkRequest, NextWorkResponse, OpenAccountRequest, OpenLeasesRequest,
-        OpenLeasesResponse, Parameters, Progress, ReleaseRequest, ReleaseResponse, ResetRequest,
-        ResetResponse, RunTerms, SettleLeasesRequest, SignOfLife, Slot, StatusRequest,
-        StepAdvice, StepQuery, StopRequest, StopResponse, SubmitEpisodesRequest,
-        SubmitEpisodesResponse, TaskFrameDescription, Wait, WatchRequest, WayPoints,
-        WorkerProgress, WorldTerms
+        AcceptedMotion, Account, AcquireRequest, AcquireResponse, AdviceTerms, AdviseRequest,
+        AdviseResponse, ArmAdvice, ArmDescription, ArmManipulation, ArmMap, ArmMotion, ArmState,
+        ArmWayPoint, BridgeLimits, BridgeStatusRequest, BridgeStatusResponse, BridgeStop,
+        BridgeWayPoint, CheckRequest, CheckResponse, ClearFaults, Condition, DescribeBridgeRequest,
+        DescribeBridgeResponse, DescribeEnvironmentRequest, DescribePolicyRequest, DescribeRequest,
+        DescribeResponse, EnvironmentCheck, EnvironmentDescription, EnvironmentReset, Episode,
+        EpisodeOrder, EvaluatePolicyRequest, EvaluatePolicyResponse, Evaluation, ExecuteRequest,
+        ExecuteResponse, ExecuteStart, Exploration, FaultInjection, Finished, GetAccountRequest,
+        GetParametersRequest, IndexRange, InjectRequest, InjectResponse, JoinRequest, JoinResponse,
+        JointDescription, JointMotion, JointSample, Lease, MotionDone, MotionOutcome,
+        MotionProgress, MotionRefusal, MotionRequest, MovedNumber, NextWorkRequest,
+        NextWorkResponse, OpenAccountRequest, OpenLeasesRequest, OpenLeasesResponse, Parameters,
+        PlayRequest, PlayResponse, PolicyDescription, Progress, Reflection, ReleaseRequest,
+        ReleaseResponse, ResetEnvironments, ResetRequest, ResetResponse, RunTerms,
+        SettleLeasesRequest, SignOfLife, Slot, StatusRequest, StepAdvice, StepEnvironments,
+        StepQuery, StopRequest, StopResponse, SubmitEpisodesRequest, SubmitEpisodesResponse,
+        TaskArm, TaskDescription, TaskFrameDescription, TaskManipulation, Wait, WatchRequest,
+        WayPoints, WorkerProgress, WorldTerms
     }
 }
 

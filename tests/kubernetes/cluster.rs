@@ -21,6 +21,8 @@ const PAUSE: Duration = Duration::from_millis(50);
 const PORT_SHIFT: u16 = 20_000;
 /// Exit code of temporary failures, such as a peer that has not started.
 const TRY_AGAIN: i32 = 75;
+/// The field that is the index of a pod in an Indexed Job.
+const COMPLETION_INDEX: &str = "metadata.annotations['batch.kubernetes.io/job-completion-index']";
 /// The secrets that `docs/cluster.md` describes.
 pub(crate) const SECRETS: [(&str, &str, &str); 2] = [
     ("tandem-secrets", "token", "the-right-token-0123"),
@@ -30,7 +32,6 @@ pub(crate) const SECRETS: [(&str, &str, &str); 2] = [
 /// Pods and their volumes.
 pub(crate) struct Cluster {
     manifests: Manifests,
-    run: String,
     workspace: TempDir,
     pods: Vec<Pod>,
 }
@@ -38,28 +39,31 @@ pub(crate) struct Cluster {
 pub(crate) struct Pod {
     pub(crate) name: String,
     workload: String,
+    /// Number of the pod in its workload.
+    index: u64,
     address: Ipv4Addr,
     process: Option<Child>,
 }
 
 impl Cluster {
-    /// Creates an empty cluster whose learner uses the run file `run`.
-    pub(crate) fn new(manifests: Manifests, run: String) -> Self {
+    pub(crate) fn new(manifests: Manifests) -> Self {
         let workspace = tempfile::tempdir().expect("a directory");
-        Self { manifests, run, workspace, pods: Vec::new() }
+        Self { manifests, workspace, pods: Vec::new() }
     }
 
     /// Adds `replicas` pods of a workload without starting them and returns their names.
     pub(crate) fn add(&mut self, workload: &str, replicas: u64) -> Vec<String> {
-        let names: Vec<String> = (0..replicas).map(|idx| format!("{workload}-{idx}")).collect();
-        for name in &names {
-            let pod = Pod {
-                name: name.clone(),
-                workload: workload.to_owned(),
-                address: new_address(),
-                process: None,
-            };
+        let pods = (0..replicas).map(|index| Pod {
+            name: format!("{workload}-{index}"),
+            workload: workload.to_owned(),
+            index,
+            address: new_address(),
+            process: None,
+        });
+        let mut names = Vec::new();
+        for pod in pods {
             fs::create_dir_all(self.root_of(&pod)).expect("a directory");
+            names.push(pod.name.clone());
             self.pods.push(pod);
         }
         names
@@ -210,6 +214,11 @@ impl Cluster {
         self.command_of(pod, &changed).output().expect("runs")
     }
 
+    /// Runs a pod's command with more arguments and waits for its end.
+    pub(crate) fn run_with(&self, name: &str, arguments: &[&str]) -> Output {
+        self.command(self.pod(name)).args(arguments).output().expect("runs")
+    }
+
     pub(crate) fn container(&self, name: &str) -> &Container {
         &self.workload(self.pod(name)).container
     }
@@ -255,10 +264,11 @@ impl Cluster {
             let value = match (&variable.value, &variable.value_from) {
                 (Some(value), None) => self.localized(pod, &expanded(value, &environment)),
                 (None, Some(ValueFrom::SecretKeyRef { name, key })) => secret(name, key),
-                (None, Some(ValueFrom::FieldRef { field_path })) => {
-                    assert_eq!(field_path, "metadata.name");
-                    pod.name.clone()
-                }
+                (None, Some(ValueFrom::FieldRef { field_path })) => match field_path.as_str() {
+                    "metadata.name" => pod.name.clone(),
+                    COMPLETION_INDEX => pod.index.to_string(),
+                    other => panic!("{}: {other:?}", variable.name),
+                },
                 other => panic!("{}: {other:?}", variable.name),
             };
             environment.insert(variable.name.clone(), value);
@@ -324,8 +334,9 @@ impl Cluster {
         match &self.workload(pod).volumes[name] {
             Source::Claim => {}
             Source::ConfigMap(map) => {
-                assert_eq!(map, "tandem-run");
-                fs::write(directory.join("run.toml"), &self.run).expect("writes");
+                let settings = &self.manifests.settings;
+                assert_eq!(*map, settings.name);
+                fs::write(directory.join(&settings.file), &settings.text).expect("writes");
             }
             Source::Secret(files) => {
                 for (file, (name, key)) in files {

@@ -110,6 +110,8 @@ pub(crate) enum Source {
 #[derive(Debug, Clone)]
 pub(crate) struct Workload {
     pub(crate) replicas: u64,
+    /// Pods of an Indexed Job.
+    pub(crate) completions: Option<u64>,
     pub(crate) container: Container,
     pub(crate) volumes: BTreeMap<String, Source>,
     labels: Value,
@@ -122,23 +124,41 @@ pub(crate) struct Service {
     pub(crate) ports: BTreeMap<u16, u16>,
 }
 
-/// The base manifests. Overlays do not change commands.
+/// A config map of one file.
+#[derive(Debug, Clone)]
+pub(crate) struct ConfigMap {
+    pub(crate) name: String,
+    pub(crate) file: String,
+    pub(crate) text: String,
+}
+
+/// The manifests of a kustomization.
 #[derive(Debug, Clone)]
 pub(crate) struct Manifests {
     pub(crate) workloads: BTreeMap<String, Workload>,
     pub(crate) services: BTreeMap<String, Service>,
-    /// The run file.
-    pub(crate) run: String,
+    /// The run file or the sweep file.
+    pub(crate) settings: ConfigMap,
 }
 
 impl Manifests {
-    pub(crate) fn read() -> Self {
-        let base = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/kubernetes/base");
-        let read = |name: &str| fs::read_to_string(base.join(name)).expect("a file of the base");
+    /// Reads the manifests of a training run. Overlays do not change their commands.
+    pub(crate) fn of_base() -> Self {
+        Self::read("base")
+    }
+
+    pub(crate) fn of_sweep() -> Self {
+        Self::read("sweep")
+    }
+
+    fn read(folder: &str) -> Self {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/kubernetes").join(folder);
+        let read = |name: &str| fs::read_to_string(folder.join(name)).expect("a file");
         let documents = |name: &str| -> Vec<Value> {
             serde_saphyr::from_multiple(&read(name)).expect("YAML documents")
         };
-        let resources: Vec<String> = at(&documents("kustomization.yaml")[0], "/resources");
+        let kustomization = documents("kustomization.yaml").swap_remove(0);
+        let resources: Vec<String> = at(&kustomization, "/resources");
         let objects: Vec<Value> = resources.iter().flat_map(|name| documents(name)).collect();
         let of_kind = |kinds: &'static [&str]| {
             objects.iter().filter(|object| kinds.contains(&at::<String>(object, "/kind").as_str()))
@@ -149,7 +169,10 @@ impl Manifests {
         let services = of_kind(&["Service"])
             .map(|object| (at(object, "/metadata/name"), service(object, &workloads)))
             .collect();
-        Self { workloads, services, run: read("run.toml") }
+        let file: String = at(&kustomization, "/configMapGenerator/0/files/0");
+        let name = at(&kustomization, "/configMapGenerator/0/name");
+        let settings = ConfigMap { name, text: read(&file), file };
+        Self { workloads, services, settings }
     }
 }
 
@@ -169,13 +192,17 @@ fn workload(object: &Value) -> Workload {
     volumes.extend(claims.iter().map(|claim| (at(claim, "/metadata/name"), Source::Claim)));
     let replicas = spec.pointer("/replicas").or_else(|| spec.pointer("/parallelism"));
     let replicas = replicas.and_then(Value::as_u64).unwrap_or(1);
+    let completions = spec.pointer("/completions").and_then(Value::as_u64);
     let labels = at(object, "/spec/template/metadata/labels");
-    Workload { replicas, container, volumes, labels }
+    Workload { replicas, completions, container, volumes, labels }
 }
 
 fn source(volume: &Value) -> Source {
     if let Some(map) = volume.pointer("/configMap/name") {
         return Source::ConfigMap(map.as_str().expect("a name").to_owned());
+    }
+    if volume.pointer("/persistentVolumeClaim").is_some() {
+        return Source::Claim;
     }
     let secret: String = at(volume, "/secret/secretName");
     let items: Vec<BTreeMap<String, String>> = at(volume, "/secret/items");

@@ -1,6 +1,5 @@
 //! The services, clients and logs of the crates `environment`, `learner`, `net`, `teacher`, `telemetry` and `worker`
-//! through their public interfaces. The
-//! tests lie in the folders of their crates; together, and without optimization, they compile in a fraction of the time.
+//! through their public interfaces. The tests lie in the folders of their crates; together, and without optimization, they compile in a fraction of the time.
 
 #![expect(
     clippy::panic,
@@ -21,5 +20,6 @@ mod ledger_tests;
 mod service_tests;
 #[path = "../../worker/tests/services/main.rs"]
 mod services;
+mod skipped;
 #[path = "../../telemetry/tests/trial_log.rs"]
 mod trial_log_tests;

@@ -10,8 +10,9 @@ use tandem_proto::pb;
 
 use crate::service_tests::run::{DEADLINE, Left, Served, Toy, calm, learner_config, real_clock};
 use crate::service_tests::toy::config;
+use crate::skipped::skip;
 
-const SKIPPED: &str = "skipped: no disk can be mounted here, that needs root";
+const NOT_MOUNTED: &str = "a run on a full disk: this process may not mount a disk";
 
 /// A disk of one megabyte; mounting it requires privileges.
 struct SmallDisk {
@@ -109,7 +110,7 @@ const TO_THE_FIRST_CHECKPOINT: usize = 14;
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_full_disk_is_reported_and_nothing_is_lost_once_there_is_room() {
     let Some(disk) = SmallDisk::mount() else {
-        println!("{SKIPPED}");
+        skip("MOUNTS", NOT_MOUNTED);
         return;
     };
     let expected = calm(config(0)).await;
@@ -131,7 +132,7 @@ async fn a_full_disk_is_reported_and_nothing_is_lost_once_there_is_room() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_disk_that_stays_full_ends_the_run_with_an_error_and_it_can_be_resumed() {
     let Some(disk) = SmallDisk::mount() else {
-        println!("{SKIPPED}");
+        skip("MOUNTS", NOT_MOUNTED);
         return;
     };
     let expected = calm(config(0)).await;
@@ -156,7 +157,7 @@ async fn a_disk_that_stays_full_ends_the_run_with_an_error_and_it_can_be_resumed
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_read_only_disk_is_reported_and_written_once_it_recovers() {
     let Some(disk) = SmallDisk::mount() else {
-        println!("{SKIPPED}");
+        skip("MOUNTS", NOT_MOUNTED);
         return;
     };
     let expected = calm(config(0)).await;

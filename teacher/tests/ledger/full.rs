@@ -8,6 +8,7 @@ use tandem_teacher::ledger::{Ledger as _, LedgerError, MemoryLedger, SqliteLedge
 use tempfile::TempDir;
 
 use crate::ledger_tests::fixture::{BOTH, NEITHER, charge, request, terms};
+use crate::skipped::skip;
 
 /// A disk of 1 MiB.
 struct SmallDisk {
@@ -41,7 +42,7 @@ impl Drop for SmallDisk {
 #[test]
 fn a_full_disk_makes_the_ledger_unavailable_until_there_is_room() {
     let Some(disk) = SmallDisk::mount() else {
-        println!("SKIPPED: this process may not mount a disk");
+        skip("MOUNTS", "a ledger on a full disk: this process may not mount a disk");
         return;
     };
     fs::write(disk.path("filler"), vec![0x5A; 600 << 10]).expect("written");

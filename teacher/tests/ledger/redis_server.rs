@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
+use crate::skipped::skip;
+
 /// A running server with an append-only file. It ends with the test.
 pub(crate) struct RedisServer {
     process: Child,
@@ -16,8 +18,7 @@ pub(crate) struct RedisServer {
 }
 
 impl RedisServer {
-    /// Starts a server. Returns `None` and prints a line if Redis is not installed; if `TANDEM_REQUIRE_REDIS` is 1, the
-    /// test fails instead.
+    /// Starts a server. Reports that and returns `None` if Redis is not installed.
     pub(crate) fn start() -> Option<Self> {
         Self::start_with(&["--appendonly", "yes"])
     }
@@ -25,10 +26,7 @@ impl RedisServer {
     /// Starts a server with other settings.
     pub(crate) fn start_with(settings: &[&str]) -> Option<Self> {
         if Command::new("redis-server").arg("--version").stdout(Stdio::null()).status().is_err() {
-            #[expect(clippy::disallowed_methods, reason = "the one switch of the tests")]
-            let required = std::env::var("TANDEM_REQUIRE_REDIS").is_ok_and(|value| value == "1");
-            assert!(!required, "redis-server is not installed, but TANDEM_REQUIRE_REDIS=1");
-            println!("SKIPPED: redis-server is not installed");
+            skip("REDIS", "the ledger in Redis: redis-server is not installed");
             return None;
         }
         let directory = tempfile::tempdir().expect("a directory");
