@@ -215,14 +215,19 @@ impl<D: Driver> Executor<D> {
     /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns
     /// whether the arms have answered.
     pub fn stop(&mut self, now_s: f64) {
-        self.halt(StopCause::Requested.anywhere(), now_s);
-        // The next command repeats the order, under a number of its own.
-        self.answers.await_stop(self.commands.number() + 1);
+        self.order_stop(StopCause::Requested, now_s);
     }
 
-    /// Stops the arms because the program that ticks the executor is about to end.
+    /// As [`stop`](Self::stop), because the program that ticks the executor is about to end.
     pub fn shut_down(&mut self, now_s: f64) {
-        self.halt(StopCause::ShutDown.anywhere(), now_s);
+        self.order_stop(StopCause::ShutDown, now_s);
+    }
+
+    /// Stops the arms, which have to confirm it.
+    fn order_stop(&mut self, cause: StopCause, now_s: f64) {
+        self.halt(cause.anywhere(), now_s);
+        // The next command repeats the order, under a number of its own.
+        self.answers.await_stop(self.commands.number() + 1);
     }
 
     /// Makes stopped arms idle. They hold their position until a motion is started.

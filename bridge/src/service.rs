@@ -86,7 +86,8 @@ pub struct Config {
 /// stops the arms.
 ///
 /// # Errors
-/// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
+/// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not confirmed
+/// the stop.
 ///
 /// # Panics
 /// Panics if the speed is not in (0, 1].
@@ -144,7 +145,8 @@ impl Bridge {
     /// Serves the arms to the clients that `server_config` admits, and then stops the arms.
     ///
     /// # Errors
-    /// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
+    /// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not
+    /// confirmed the stop.
     pub async fn serve(
         self,
         incoming: impl Into<Incoming>,
