@@ -230,15 +230,17 @@ impl<D: Driver> Executor<D> {
         self.answers.await_stop(self.commands.number() + 1);
     }
 
-    /// Makes stopped arms idle. They hold their position until a motion is started.
+    /// Makes stopped arms idle. They hold their position until a motion is started. Idle arms stay as they are.
     ///
     /// # Errors
-    /// Returns an error if the client with `token` does not own the arms, their states are not good, or they are beyond
-    /// a limit at which they would be stopped again.
+    /// Returns an error if the client with `token` does not own the arms, a motion is in progress, their states are not
+    /// good, or they are beyond a limit at which they would be stopped again.
     pub fn reset(&mut self, token: Token, now_s: f64) -> Result<(), ResetError> {
         self.renew(token, now_s)?;
-        if self.phase() != Phase::Stopped {
-            return Err(ResetError::NotStopped(self.phase()));
+        match self.phase() {
+            Phase::Stopped => {}
+            Phase::Idle => return Ok(()),
+            moving => return Err(ResetError::NotStopped(moving)),
         }
         if let Some(error) = &self.exchange_error {
             return Err(ResetError::Driver(error.clone()));

@@ -1,8 +1,8 @@
 """Clients of Tandem's services: `Teacher`, `Learner` and `Bridge`.
 
 Addresses are `HOST:PORT` or URIs; a `Learner` also takes a run directory. A call waits up to `timeout_s` for a service
-that is away, and raises `CallError`. Every call may be repeated. Messages are those of
-`proto/proto/tandem/v1`, whose comments describe their fields.
+that is away, and raises `CallError`. Calls may be repeated, except those that begin or end a lease of a bridge or play
+a motion. Messages are those of `proto/proto/tandem/v1`, whose comments describe their fields.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ _KEEP_ALIVE_S = 0.04
 """Time between two signs of life; the bridge requires one every 0.1 s."""
 _PROBE_S = 1.0
 _STEP_S = 0.04
-_RESET_ATTEMPTS = 11
+_RESET_S = 2.0
+"""Time for which a reset is repeated: behind kinova-ros, ten good states take a second."""
 _RESET_PAUSE_S = 0.1
 
 _ClientT = TypeVar("_ClientT", bound="_Client")
@@ -457,20 +458,20 @@ class Lease:
         self._token = token
 
     def reset(self) -> None:
-        """Releases stopped arms, so that they accept motions. Inspect the arms first.
+        """Releases stopped arms, so that they accept motions. Inspect the arms first. Idle arms stay as they are.
 
-        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to a second.
+        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to two seconds.
         """
         request = bridge_pb2.ResetRequest(token=self._token)
-        for _ in range(_RESET_ATTEMPTS - 1):
+        deadline_s = time.monotonic() + _RESET_S
+        while True:
             try:
                 self._bridge._call(self._bridge._stub.Reset, request)
                 return
             except CallError as error:
-                if error.code != "FAILED_PRECONDITION":
+                if error.code != "FAILED_PRECONDITION" or time.monotonic() >= deadline_s:
                     raise
             time.sleep(_RESET_PAUSE_S)
-        self._bridge._call(self._bridge._stub.Reset, request)
 
     def renew(self) -> None:
         """Renews the lease, which otherwise ends some seconds after the last request."""

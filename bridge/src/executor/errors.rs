@@ -81,7 +81,7 @@ pub enum ResetError {
     /// The client does not own the arms.
     #[error(transparent)]
     Lease(#[from] LeaseError),
-    /// The arms are not stopped.
+    /// A motion is in progress.
     #[error("the arms are not stopped but {0:?}")]
     NotStopped(Phase),
     /// An arm reports a fault, or a torque beyond the limit.
