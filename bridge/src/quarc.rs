@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use crate::driver::{Command, Driver, DriverError, Order, PairState};
 use crate::quarc::codec::STATE_BYTES;
-use crate::quarc::state_buffer::{StateBuffer, keep_faults};
+use crate::quarc::state_buffer::{StateBuffer, keep_peaks};
 
 pub mod arm_side;
 pub mod codec;
@@ -217,7 +217,7 @@ impl QuarcDriver {
                     let before = new.take();
                     new = match (self.buffered.push(&buffer[..n])?, before) {
                         (Some(mut state), Some(before)) => {
-                            keep_faults(&mut state, &before);
+                            keep_peaks(&mut state, &before);
                             Some(state)
                         }
                         (state, before) => state.or(before),
