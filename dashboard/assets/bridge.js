@@ -115,7 +115,7 @@ function tiles(s) {
   return [
     ["Owner", isNumber(s.lease_left_s) ? "a client" : "none",
       isNumber(s.lease_left_s) ? `lease for ${s.lease_left_s.toFixed(1)} s` : "free for any client", false],
-    ["Joints", s.at_rest ? "at rest" : "moving", s.is_connected ? "driver connected" : "driver not connected", false],
+    ["Joints", s.arms.length === 0 ? "unknown" : s.at_rest ? "at rest" : "moving", s.is_connected ? "driver connected" : "driver not connected", false],
     ...faults,
     ...(s.injected.length ? [["Drill", s.injected.join("; "), "injected faults; clear them with tandem bridge inject --clear", true]] : []),
     ["Between arms", mm(s.arms_gap_m), `stopped below ${mm(s.terms.arms_gap_m)}`, isBelow(s.arms_gap_m, 1.25 * s.terms.arms_gap_m)],
