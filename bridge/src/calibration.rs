@@ -155,7 +155,7 @@ pub struct Operator<'a> {
     pub clock: &'a dyn Clock,
     /// Receives the times of each joint.
     pub report: &'a mut dyn FnMut(JointTiming),
-    /// Returns whether the measurement has to end. Called once per period.
+    /// Returns true if the measurement has to end. Called once per period.
     pub is_interrupted: &'a dyn Fn() -> bool,
 }
 
@@ -208,7 +208,7 @@ fn of_arm(joints: &[ArmTiming], period_s: f64) -> ArmTiming {
     ArmTiming { lag_s, reaction_s, brake_s: slowest(|joint| joint.brake_s) }
 }
 
-/// Returns whether the cause is that commands, states or their effects were late.
+/// Returns true if the cause is that commands, states or their effects were late.
 fn is_delay(cause: &StopCause) -> bool {
     use StopCause as C;
     matches!(cause, C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_))
@@ -328,7 +328,7 @@ impl Bench<'_> {
         Ok(phase)
     }
 
-    /// Returns whether a machine that is too slow explains the stop. Drives that wait too long for a command report a
+    /// Returns true if a machine that is too slow explains the stop. Drives that wait too long for a command report a
     /// fault, too; any other fault needs a person.
     fn was_late(&self, stop: &Stop) -> bool {
         let explains_fault = stop.when_s - self.delayed_s <= DELAY_EFFECT_S;

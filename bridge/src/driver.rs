@@ -45,8 +45,8 @@ pub trait Driver {
     /// Ends the connection to arms that have fallen silent, for this reason, so that another one can take its place.
     fn disconnect(&mut self, _reason: &DriverError) {}
 
-    /// Returns whether the arms have answered the last order to stop. Drivers whose arms do not answer orders return true:
-    /// the executor waits for a state.
+    /// Returns true if the arms have answered the last order to stop. Drivers whose arms do not answer orders return
+    /// true: the executor waits for a state.
     fn confirms_stop(&self) -> bool {
         true
     }

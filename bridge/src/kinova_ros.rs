@@ -219,7 +219,7 @@ impl KinovaRosDriver {
         })
     }
 
-    /// Receives all waiting messages, and waits once if they complete no state. Returns whether there is a new state.
+    /// Receives all waiting messages, and waits once if they complete no state. Returns true if there is a new state.
     fn receive(&mut self, timeout: Duration) -> Result<bool, DriverError> {
         if self.drain()? {
             return Ok(true);
@@ -258,7 +258,7 @@ impl KinovaRosDriver {
         self.call_service(arm, Service::Stop)
     }
 
-    /// Forwards a command to an arm. Returns whether its velocities were published.
+    /// Forwards a command to an arm. Returns true if its velocities were published.
     fn drive(
         &mut self,
         arm: usize,
@@ -280,7 +280,7 @@ impl KinovaRosDriver {
         }
     }
 
-    /// Publishes velocities, or a goal of the fingers. Returns whether it published velocities.
+    /// Publishes velocities, or a goal of the fingers. Returns true if it published velocities.
     fn publish(
         &mut self,
         arm: usize,
@@ -373,7 +373,7 @@ impl Driver for KinovaRosDriver {
         self.unless_failed(|_| Err::<(), _>(reason.clone())).ok();
     }
 
-    /// Returns whether every node has answered the call of `in/stop`.
+    /// Returns true if every node has answered the call of `in/stop`.
     fn confirms_stop(&self) -> bool {
         self.failure.is_none() && self.arms.iter().all(|arm| arm.control == Control::Stopped)
     }

@@ -69,7 +69,7 @@ pub struct Config {
     pub reconnect: Option<Reconnect>,
     /// The cell file of the arms.
     pub cell: CellFile,
-    /// How fast each arm reacts: the measured times, or else those that the driver assumes.
+    /// The times in which each arm reacts: the measured ones, or else those that the driver assumes.
     pub timings: Vec<ArmTiming>,
     /// The name of the cell file; empty for the default cell.
     pub cell_name: String,
@@ -85,8 +85,8 @@ pub struct Config {
 /// stops the arms.
 ///
 /// # Errors
-/// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not confirmed
-/// the stop.
+/// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not
+/// confirmed the stop.
 ///
 /// # Panics
 /// Panics if the speed is not in (0, 1].

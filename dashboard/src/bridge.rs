@@ -13,7 +13,7 @@ use crate::events::{Level, forget_old};
 use crate::page;
 use crate::site::{Frame, Site, StopAction};
 
-/// What does not change while a bridge runs.
+/// The values that do not change while a bridge runs.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct BridgeTerms {
     /// Name of the driver.

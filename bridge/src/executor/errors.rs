@@ -108,7 +108,7 @@ pub enum ResetError {
     States {
         /// The number of consecutive good states.
         got: u32,
-        /// Why the newest state is not good, if it is not.
+        /// The fault of the newest state, if it has one.
         rejected: Option<StopCause>,
     },
     /// The arms have not confirmed the last order to stop.

@@ -80,7 +80,7 @@ impl Monitor {
         self.newest.as_ref().map_or(f64::INFINITY, |seen| now_s - seen.at_s - self.period_s)
     }
 
-    /// Returns whether every joint was at rest in the newest state.
+    /// Returns true if every joint was at rest in the newest state.
     pub(crate) fn at_rest(&self) -> bool {
         let rests = |arm: &ArmReading| {
             arm.velocities.iter().all(|rate| rate.abs() <= self.settings.rest_radps)

@@ -8,9 +8,9 @@ use crate::kinova_ros::protocol::ArmMessage;
 pub(crate) struct StateMerger {
     /// The newest message of each arm.
     newest: Vec<Option<ArmMessage>>,
-    /// Whether each arm has reported since the last state of the pair, near enough to the other arms.
+    /// True for arms that have reported since the last state of the pair, near enough to the other arms.
     new: Vec<bool>,
-    /// Whether no state of the pair contains the newest message of each arm.
+    /// True for arms whose newest message no state of the pair contains.
     is_unseen: Vec<bool>,
     sequence: u64,
     /// Largest difference between the time stamps of one state, seconds.

@@ -125,7 +125,8 @@ impl ArmsThread {
     /// Waits for the thread's end, at most for `grace`.
     ///
     /// # Errors
-    /// Returns an error if the thread has panicked, its driver hangs, or the arms have not confirmed the stop at its end.
+    /// Returns an error if the thread has panicked, its driver hangs, or the arms have not confirmed the stop at its
+    /// end.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
             Ok(_ended) => self.thread.join().unwrap_or(Err(Error::Panicked)),
