@@ -1,8 +1,8 @@
 //! Measures how fast arms react: lag, reaction and braking time.
 //!
 //! **Procedure.** One joint after the other turns by a few degrees out and back at a share of its speed, which gives
-//! the lag, and is then stopped several times in the middle of such a turn, which gives the reaction and the braking
-//! time. An [`Executor`] plays every turn, so all checks and the envelope apply with the settings that hold until the
+//! the lag, and is then stopped several times in the middle of such a swing, which gives the reaction and the braking
+//! time. An [`Executor`] plays every swing, so all checks and the envelope apply with the settings that hold until the
 //! measurement. Only one joint moves at a time. The arms are reset after intended stops and after delays of the
 //! machine; any other stop ends the measurement, also one that would follow while the arms are stopped already.
 //!
@@ -28,16 +28,16 @@ use crate::executor::{
 use crate::service::{BoxDriver, Clock, next_time};
 
 use estimate::{StopFit, fit_stop, lag_s};
-use turn::Turn;
+use swing::Swing;
 
 mod estimate;
-mod turn;
+mod swing;
 
 /// Smallest and largest share of a joint's speed at which it is measured.
 pub const SPEED_SHARES: [f64; 2] = [0.1, 0.5];
 /// Stops per joint.
 const N_STOPS: usize = 3;
-/// Attempts of a turn that a busy machine stops.
+/// Attempts of a swing that a busy machine stops.
 const N_ATTEMPTS: usize = 5;
 /// Time for which the arms are watched after a stop, seconds.
 const WATCH_S: f64 = 0.5;
@@ -45,7 +45,7 @@ const WATCH_S: f64 = 0.5;
 const DELAY_EFFECT_S: f64 = 0.2;
 /// Time in which the states must become good, seconds.
 const READY_S: f64 = 3.0;
-/// Share of the constant part of a turn after which it is stopped.
+/// Share of the constant part of a swing after which it is stopped.
 const STOP_SHARE: f64 = 0.85;
 /// The only client of the executor.
 const OWNER: Token = Token(1);
@@ -81,7 +81,7 @@ pub enum CalibrationError {
         arm: ArmIndex,
         /// The joint, counted from 0.
         joint: usize,
-        /// The turn, degrees.
+        /// The swing, degrees.
         degrees: f64,
         /// The refused limit.
         refusal: String,
@@ -155,7 +155,7 @@ pub struct Operator<'a> {
     pub clock: &'a dyn Clock,
     /// Receives the times of each joint.
     pub report: &'a mut dyn FnMut(JointTiming),
-    /// Returns whether the measurement has to end. Called once per period.
+    /// Returns true if the measurement has to end. Called once per period.
     pub is_interrupted: &'a dyn Fn() -> bool,
 }
 
@@ -208,7 +208,7 @@ fn of_arm(joints: &[ArmTiming], period_s: f64) -> ArmTiming {
     ArmTiming { lag_s, reaction_s, brake_s: slowest(|joint| joint.brake_s) }
 }
 
-/// Returns whether the cause is that commands, states or their effects were late.
+/// Returns true if the cause is that commands, states or their effects were late.
 fn is_delay(cause: &StopCause) -> bool {
     use StopCause as C;
     matches!(cause, C::TickLate(_) | C::StateStale(_) | C::StateDelayed(_) | C::CommandLost(_))
@@ -241,7 +241,7 @@ impl Bench<'_> {
         for (arm, placed) in self.cell.arms.iter().enumerate() {
             let mut joints = Vec::with_capacity(placed.model.n_joints());
             for joint in 0..placed.model.n_joints() {
-                let timing = self.measure(arm, joint, speed)?;
+                let timing = self.measure(ArmIndex(arm), joint, speed)?;
                 report(JointTiming { arm: ArmIndex(arm), joint, timing });
                 joints.push(timing);
             }
@@ -253,32 +253,33 @@ impl Bench<'_> {
     /// Measures a joint.
     fn measure(
         &mut self,
-        arm: usize,
+        arm: ArmIndex,
         joint: usize,
         speed: f64,
     ) -> Result<ArmTiming, CalibrationError> {
-        let fastest = self.cell.arms[arm].model.joints[joint].speed_radps;
-        let turn = Turn { radps: speed * fastest, radps2: 0.5 * fastest / self.ramp_s };
+        let fastest = self.cell.arms[arm.0].model.joints[joint].speed_radps;
+        let (radps, radps2) = (speed * fastest, 0.5 * fastest / self.ramp_s);
+        let swing = Swing { arm, joint, radps, radps2 };
         self.ready()?;
-        let home = self.angle(arm, joint);
-        let side = self.side(arm, joint, &turn)?;
+        let home = self.angle(&swing);
+        let side = self.side(&swing)?;
         let n_before = self.exchanges.borrow().len();
         self.attempt(|bench| {
-            bench.go_to(arm, joint, home, &turn)?;
-            bench.turn_by(arm, joint, side * turn.full_rad(), &turn, None)?;
-            bench.go_to(arm, joint, home, &turn)
+            bench.go_to(home, &swing)?;
+            bench.swing_by(side * swing.full_rad(), &swing, None)?;
+            bench.go_to(home, &swing)
         })?;
         let lag_s =
-            lag_s(&self.exchanges.borrow()[n_before..], arm, joint, self.executor.period_s());
+            lag_s(&self.exchanges.borrow()[n_before..], arm.0, joint, self.executor.period_s());
         let mut fits = Vec::with_capacity(N_STOPS);
         for _ in 0..N_STOPS {
             fits.push(self.attempt(|bench| {
-                bench.go_to(arm, joint, home, &turn)?;
-                bench.stop_in_turn(arm, joint, side, &turn)
+                bench.go_to(home, &swing)?;
+                bench.stop_in_swing(side, &swing)
             })?);
         }
-        self.attempt(|bench| bench.go_to(arm, joint, home, &turn))?;
-        let not_moving = CalibrationError::NotMoving { arm: ArmIndex(arm), joint };
+        self.attempt(|bench| bench.go_to(home, &swing))?;
+        let not_moving = CalibrationError::NotMoving { arm, joint };
         let lag_s = lag_s.ok_or(not_moving)?;
         let reaction_s = fits.iter().map(|fit| fit.begins_s).fold(0.0, f64::max);
         fits.sort_by(|a, b| a.takes_s.total_cmp(&b.takes_s));
@@ -327,7 +328,7 @@ impl Bench<'_> {
         Ok(phase)
     }
 
-    /// Returns whether a machine that is too slow explains the stop. Drives that wait too long for a command report a
+    /// Returns true if a machine that is too slow explains the stop. Drives that wait too long for a command report a
     /// fault, too; any other fault needs a person.
     fn was_late(&self, stop: &Stop) -> bool {
         let explains_fault = stop.when_s - self.delayed_s <= DELAY_EFFECT_S;
@@ -376,17 +377,17 @@ impl Bench<'_> {
         }
     }
 
-    /// Returns the measured angle of a joint, radians; 0 if there is no state.
-    fn angle(&self, arm: usize, joint: usize) -> f64 {
-        self.executor.state().map_or(0.0, |state| state.arms[arm].angles[joint])
+    /// Returns the measured angle of the joint, radians; 0 if there is no state.
+    fn angle(&self, swing: &Swing) -> f64 {
+        self.executor.state().map_or(0.0, |state| state.arms[swing.arm.0].angles[swing.joint])
     }
 
-    /// Returns the direction, 1 or -1, in which the joint has room for a full turn.
-    fn side(&self, arm: usize, joint: usize, turn: &Turn) -> Result<f64, CalibrationError> {
+    /// Returns the direction, 1 or -1, in which the joint has room for a full swing.
+    fn side(&self, swing: &Swing) -> Result<f64, CalibrationError> {
         let no_room = |refusal: String| CalibrationError::NoRoom {
-            arm: ArmIndex(arm),
-            joint,
-            degrees: turn.full_rad().to_degrees(),
+            arm: swing.arm,
+            joint: swing.joint,
+            degrees: swing.full_rad().to_degrees(),
             refusal,
         };
         let Some(state) = self.executor.state() else {
@@ -394,39 +395,31 @@ impl Bench<'_> {
         };
         let at: Vec<Joints> = state.arms.iter().map(|arm| arm.angles).collect();
         let check = |side: f64| {
-            let motion = turn.motion(state, arm, joint, side * turn.full_rad());
+            let motion = swing.motion(state, side * swing.full_rad());
             self.executor.checker().check(motion, &at).map(|_| side)
         };
         check(1.0).or_else(|refused| check(-1.0).map_err(|_also| no_room(refused.to_string())))
     }
 
-    /// Turns a joint to `angle`, radians, if it is not there.
-    fn go_to(
-        &mut self,
-        arm: usize,
-        joint: usize,
-        angle: f64,
-        turn: &Turn,
-    ) -> Result<(), CalibrationError> {
-        let by = angle - self.angle(arm, joint);
-        if by.abs() < turn.least_rad() {
+    /// Turns the joint to `angle`, radians, if it is not there.
+    fn go_to(&mut self, angle: f64, swing: &Swing) -> Result<(), CalibrationError> {
+        let by = angle - self.angle(swing);
+        if by.abs() < swing.least_rad() {
             return Ok(());
         }
-        self.turn_by(arm, joint, by, turn, None)
+        self.swing_by(by, swing, None)
     }
 
-    /// Turns a joint by `by` radians, and stops it after `stop_s` seconds if that is given.
-    fn turn_by(
+    /// Turns the joint by `by` radians. Returns after `stop_s` seconds of the swing if they are given.
+    fn swing_by(
         &mut self,
-        arm: usize,
-        joint: usize,
         by: f64,
-        turn: &Turn,
+        swing: &Swing,
         stop_s: Option<f64>,
     ) -> Result<(), CalibrationError> {
         self.ready()?;
         let state = self.executor.state().ok_or(CalibrationError::Start(StartError::NoState))?;
-        let motion = turn.motion(state, arm, joint, by);
+        let motion = swing.motion(state, by);
         let started = self.executor.start(OWNER, motion, 1.0, self.clock.now_s());
         started.map_err(CalibrationError::Start)?;
         loop {
@@ -442,16 +435,10 @@ impl Bench<'_> {
         }
     }
 
-    /// Stops a joint in the middle of a turn, and returns how it came to rest.
-    fn stop_in_turn(
-        &mut self,
-        arm: usize,
-        joint: usize,
-        side: f64,
-        turn: &Turn,
-    ) -> Result<StopFit, CalibrationError> {
-        let by = side * turn.full_rad();
-        self.turn_by(arm, joint, by, turn, Some(turn.ramp_s() + STOP_SHARE * Turn::CONSTANT_S))?;
+    /// Stops the joint in the middle of a swing, and returns how it came to rest.
+    fn stop_in_swing(&mut self, side: f64, swing: &Swing) -> Result<StopFit, CalibrationError> {
+        let stop_s = swing.ramp_s() + STOP_SHARE * Swing::CONSTANT_S;
+        self.swing_by(side * swing.full_rad(), swing, Some(stop_s))?;
         let n_before = self.exchanges.borrow().len();
         self.executor.stop(self.clock.now_s());
         let until_s = self.clock.now_s() + WATCH_S;
@@ -465,9 +452,9 @@ impl Bench<'_> {
         }
         let fit = {
             let exchanges = self.exchanges.borrow();
-            fit_stop(&exchanges, n_before, arm, joint, side)
+            fit_stop(&exchanges, n_before, swing.arm.0, swing.joint, side)
         };
-        fit.ok_or(CalibrationError::NotMoving { arm: ArmIndex(arm), joint })
+        fit.ok_or(CalibrationError::NotMoving { arm: swing.arm, joint: swing.joint })
     }
 
     fn stopped(&self) -> CalibrationError {

@@ -28,7 +28,7 @@ const MODELS: [&ArmModel; 1] = [&MICO_4];
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellFile {
-    /// Whether the arms report torques without those that carry their own weight; `None` for the driver's default.
+    /// True if the arms report torques without those that carry their own weight; `None` for the driver's default.
     pub reports_torques: Option<bool>,
     /// Behind kinova-ros, the time constant of the mean that is subtracted from efforts, 0.1 to 2 seconds; `None` for
     /// the default, 0.4. Only without `reports_torques`.
@@ -127,7 +127,7 @@ pub struct Simulated {
     pub brake_s: f64,
 }
 
-/// How fast an arm reacts, as measured or assumed.
+/// The times in which an arm reacts, as measured or assumed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmTiming {
     /// Usual time from a command until measured angles reflect it, seconds.
@@ -251,7 +251,7 @@ impl CellFile {
 }
 
 impl Arm {
-    /// Returns whether all times of the arm were measured.
+    /// Returns true if all times of the arm were measured.
     #[must_use]
     pub fn is_measured(&self) -> bool {
         self.times().iter().all(|(_, value)| value.is_some())

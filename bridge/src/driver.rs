@@ -45,8 +45,8 @@ pub trait Driver {
     /// Ends the connection to arms that have fallen silent, for this reason, so that another one can take its place.
     fn disconnect(&mut self, _reason: &DriverError) {}
 
-    /// Returns whether the arms have answered the last order to stop. Drivers whose arms do not answer orders return true:
-    /// the executor waits for a state.
+    /// Returns true if the arms have answered the last order to stop. Drivers whose arms do not answer orders return
+    /// true: the executor waits for a state.
     fn confirms_stop(&self) -> bool {
         true
     }
@@ -128,6 +128,23 @@ pub struct ArmReading {
     pub opening: f64,
     /// The reported faults.
     pub faults: Faults,
+}
+
+impl ArmReading {
+    /// Adds what a single reading may show from `before`, which this one replaces unseen: its faults, and the torque of
+    /// each joint whose magnitude was larger.
+    pub(crate) fn keep_peaks(&mut self, before: &Self) {
+        self.faults.drive |= before.faults.drive;
+        self.faults.contact |= before.faults.contact;
+        self.faults.emergency_stop |= before.faults.emergency_stop;
+        if let (Some(torques_nm), Some(before_nm)) = (&mut self.torques_nm, &before.torques_nm) {
+            for (torque_nm, before_nm) in torques_nm.iter_mut().zip(before_nm.iter()) {
+                if before_nm.abs() > torque_nm.abs() {
+                    *torque_nm = *before_nm;
+                }
+            }
+        }
+    }
 }
 
 /// The faults that an arm reports.

@@ -9,7 +9,7 @@ use crate::service::{Clock, next_time};
 /// Time in which the arms have to confirm the order to stop, seconds.
 const CONFIRM_S: f64 = 1.0;
 
-/// Stops the arms, and ticks until they confirm it, for at most [`CONFIRM_S`]. Returns whether they have.
+/// Stops the arms, and ticks until they confirm it, for at most [`CONFIRM_S`]. Returns true if they have.
 pub(crate) fn stop<D: Driver>(executor: &mut Executor<D>, clock: &dyn Clock) -> bool {
     let mut at_s = clock.now_s();
     let until_s = at_s + CONFIRM_S;

@@ -26,7 +26,7 @@ use crate::executor::lease::Lease;
 use crate::executor::monitor::{ExpectedState, Monitor};
 use crate::executor::playback::{Playback, TickContext};
 use crate::executor::state::ArmsState;
-use crate::executor::stop::Breach;
+use crate::executor::stop::LocatedCause;
 
 pub use checked::{CheckError, CheckedMotion, Checker};
 pub use errors::{ResetError, StartError};
@@ -215,25 +215,32 @@ impl<D: Driver> Executor<D> {
     /// Stops the arms on request. No ownership is needed. [`stop_is_confirmed`](Self::stop_is_confirmed) returns
     /// whether the arms have answered.
     pub fn stop(&mut self, now_s: f64) {
-        self.halt(StopCause::Requested.anywhere(), now_s);
+        self.order_stop(StopCause::Requested, now_s);
+    }
+
+    /// As [`stop`](Self::stop), because the program that ticks the executor is about to end.
+    pub fn shut_down(&mut self, now_s: f64) {
+        self.order_stop(StopCause::ShutDown, now_s);
+    }
+
+    /// Stops the arms, which have to confirm it.
+    fn order_stop(&mut self, cause: StopCause, now_s: f64) {
+        self.halt(cause.anywhere(), now_s);
         // The next command repeats the order, under a number of its own.
         self.answers.await_stop(self.commands.number() + 1);
     }
 
-    /// Stops the arms because the program that ticks the executor is about to end.
-    pub fn shut_down(&mut self, now_s: f64) {
-        self.halt(StopCause::ShutDown.anywhere(), now_s);
-    }
-
-    /// Makes stopped arms idle. They hold their position until a motion is started.
+    /// Makes stopped arms idle. They hold their position until a motion is started. Idle arms stay as they are.
     ///
     /// # Errors
-    /// Returns an error if the client with `token` does not own the arms, their states are not good, or they are beyond
-    /// a limit at which they would be stopped again.
+    /// Returns an error if the client with `token` does not own the arms, a motion is in progress, their states are not
+    /// good, or they are beyond a limit at which they would be stopped again.
     pub fn reset(&mut self, token: Token, now_s: f64) -> Result<(), ResetError> {
         self.renew(token, now_s)?;
-        if self.phase() != Phase::Stopped {
-            return Err(ResetError::NotStopped(self.phase()));
+        match self.phase() {
+            Phase::Stopped => {}
+            Phase::Idle => return Ok(()),
+            moving => return Err(ResetError::NotStopped(moving)),
         }
         if let Some(error) = &self.exchange_error {
             return Err(ResetError::Driver(error.clone()));
@@ -255,7 +262,7 @@ impl<D: Driver> Executor<D> {
         self.commands.keep_openings(state);
         let commands = self.commands.stationary();
         let checked = self.envelope.check(&commands, self.commands.velocities(), state, stale_s);
-        if let Err(Breach { arm, cause, .. }) = checked {
+        if let Err(LocatedCause { arm, cause, .. }) = checked {
             return Err(ResetError::Limit { arm, cause });
         }
         self.state = ArmsState::Idle { at: state.arms.iter().map(|arm| arm.angles).collect() };
@@ -298,8 +305,8 @@ impl<D: Driver> Executor<D> {
     /// Starts a period at `now_s`, seconds: sends a command, receives a state and returns the phase after that. Must be
     /// called once per period.
     pub fn tick(&mut self, now_s: f64) -> Phase {
-        let order = self.next_order(now_s).unwrap_or_else(|breach| {
-            self.halt(breach, now_s);
+        let order = self.next_order(now_s).unwrap_or_else(|cause| {
+            self.halt(cause, now_s);
             Order::Stop
         });
         let command = self.commands.push(order);
@@ -312,8 +319,8 @@ impl<D: Driver> Executor<D> {
                 let velocities = self.commands.visible_velocities();
                 let number = self.commands.number();
                 let expected = ExpectedState { number, velocities: &velocities };
-                if let Err(breach) = self.monitor.accept(now_s, state, &expected) {
-                    self.halt(breach, now_s);
+                if let Err(cause) = self.monitor.accept(now_s, state, &expected) {
+                    self.halt(cause, now_s);
                 }
             }
             Err(error) => {
@@ -325,8 +332,8 @@ impl<D: Driver> Executor<D> {
         self.phase()
     }
 
-    /// Returns the order of the coming period, or the limit that it would break.
-    fn next_order(&mut self, now_s: f64) -> Result<Order, Breach> {
+    /// Returns the order of the coming period, or the cause of a stop.
+    fn next_order(&mut self, now_s: f64) -> Result<Order, LocatedCause> {
         let since_s = self.ticked_s.replace(now_s).map_or(self.period_s, |before| now_s - before);
         if matches!(self.state, ArmsState::Stopped(_)) {
             return Ok(Order::Stop);
@@ -373,7 +380,7 @@ impl<D: Driver> Executor<D> {
     }
 
     /// Ends a motion whose arms rest at its end and whose grippers have received its last openings.
-    fn settle(&mut self) -> Result<(), Breach> {
+    fn settle(&mut self) -> Result<(), LocatedCause> {
         let (ArmsState::Playing { playback, holding: false }, Some(state)) =
             (&self.state, self.monitor.state())
         else {
@@ -406,8 +413,8 @@ impl<D: Driver> Executor<D> {
     }
 
     /// Stops the arms in the fastest way. Keeps the first cause and the newest one.
-    fn halt(&mut self, breach: Breach, now_s: f64) {
-        let stop = breach.at(now_s);
+    fn halt(&mut self, cause: LocatedCause, now_s: f64) {
+        let stop = cause.at(now_s);
         if matches!(self.state, ArmsState::Stopped(_)) {
             self.later_stop = Some(stop);
         } else {
@@ -438,7 +445,7 @@ fn stale_periods(stale_s: f64, period_s: f64) -> usize {
 }
 
 /// Checks that idle arms are at most `allowed` radians from the position that they hold.
-fn check_in_place(at: &[Joints], state: &PairState, allowed: f64) -> Result<(), Breach> {
+fn check_in_place(at: &[Joints], state: &PairState, allowed: f64) -> Result<(), LocatedCause> {
     for (arm, (at, reading)) in at.iter().zip(&state.arms).enumerate() {
         for (joint, (at, angle)) in at.iter().zip(reading.angles.iter()).enumerate() {
             let got = (at - angle).abs();

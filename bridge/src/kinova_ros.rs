@@ -60,9 +60,11 @@ use crate::kinova_ros::preparation::Preparation;
 use crate::kinova_ros::protocol::{ArmDecoder, RosMessage};
 use crate::kinova_ros::websocket::RosbridgeSocket;
 
+pub use config::{Efforts, KinovaArm, KinovaRosConfig};
 pub use fingers::FingerSettings;
 pub use homing::{HomingError, home};
 
+mod config;
 mod efforts;
 mod fingers;
 mod following;
@@ -85,76 +87,6 @@ const ANGLES_RESULT: &str = "joints_action/joint_angles/result";
 const LOG_TOPIC: &str = "/rosout";
 /// Number of waits in the time limit of the first state.
 const N_FIRST_WAITS: u32 = 100;
-
-/// The configuration of the driver.
-#[derive(Debug, Clone, PartialEq)]
-pub struct KinovaRosConfig {
-    /// The address of rosbridge: `host:port` or `ws://host:port`. Rosbridge's default port is 9090.
-    pub address: String,
-    /// The arms, in the order of the work cell.
-    pub arms: [KinovaArm; 2],
-    /// Time limit of the connection, and then of the first state. Default 3 s each.
-    pub connect_timeout: Duration,
-    /// Exchanges within which a service has to respond. Default 100.
-    pub answer_exchanges: u32,
-    /// Largest difference between the time stamps of the two arms' states, seconds. Default 0.1.
-    pub skew_s: f64,
-    /// The meaning of efforts. Default [`Efforts::Unused`].
-    pub efforts: Efforts,
-    /// The goals of the grippers.
-    pub fingers: FingerSettings,
-}
-
-/// The meaning of the efforts that the nodes publish.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Efforts {
-    /// Efforts are not used.
-    Unused,
-    /// Torques without those that carry the arm: the nodes have
-    /// `torque_parameters/publish_torque_with_gravity_compensation` set.
-    Compensated,
-    /// Torques that include the arm's own weight, as the nodes publish them by default. Their difference from a moving
-    /// mean is used, which shows a sudden push and not a steady one.
-    Changes {
-        /// The time constant of the mean, seconds.
-        mean_s: f64,
-    },
-}
-
-/// The names of an arm in ROS.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct KinovaArm {
-    /// The driver's node, such as `/left/m1n4s200_driver`. Topics and services are below it.
-    pub node: String,
-    /// The prefix of the joints' names, such as `m1n4s200_`: the node's parameter `robot_name` or else its type, and
-    /// `_`.
-    pub joint_prefix: String,
-}
-
-impl KinovaArm {
-    /// Returns the names of an `m1n4s200` whose driver is the node `node`.
-    #[must_use]
-    pub fn mico(node: impl Into<String>) -> Self {
-        Self { node: node.into(), joint_prefix: "m1n4s200_".into() }
-    }
-}
-
-impl KinovaRosConfig {
-    /// Returns the defaults for two `m1n4s200` behind rosbridge at `address`, under `/left/m1n4s200_driver` and
-    /// `/right/m1n4s200_driver`.
-    #[must_use]
-    pub fn at(address: impl Into<String>) -> Self {
-        Self {
-            address: address.into(),
-            arms: ["left", "right"].map(|side| KinovaArm::mico(format!("/{side}/m1n4s200_driver"))),
-            connect_timeout: Duration::from_secs(3),
-            answer_exchanges: 100,
-            skew_s: 0.1,
-            efforts: Efforts::Unused,
-            fingers: FingerSettings::default(),
-        }
-    }
-}
 
 /// Returns initial settings of the executor. They allow for states at 10 Hz whose arms report at different times, for
 /// the 50 ms of `in/start` and for 60 ms through rosbridge. Reaction and lag are estimates until they are measured on
@@ -184,6 +116,8 @@ pub struct KinovaRosDriver {
     number: u64,
     /// Counts the identifiers of calls and goals.
     n_ids: u64,
+    /// The time stamp of the first state, seconds. No other connection has the same one.
+    first_stamp_s: f64,
     /// True while the connection only listens: a failure stops no arm, since another program may be moving it.
     is_passive: bool,
     /// The error that ended the connection.
@@ -202,13 +136,23 @@ impl KinovaRosDriver {
         let arms: Vec<ArmNode> = config.arms.iter().map(arm).collect();
         let merge = StateMerger::new(arms.len(), config.skew_s);
         let newest = PairState { sequence: 0, stamp_s: 0.0, newest_command: None, arms: vec![] };
-        let (number, n_ids, is_passive, failure) = (0, 0, false, None);
-        let mut driver =
-            Self { config, socket, arms, merge, newest, number, n_ids, is_passive, failure };
+        let mut driver = Self {
+            config,
+            socket,
+            arms,
+            merge,
+            newest,
+            number: 0,
+            n_ids: 0,
+            first_stamp_s: 0.0,
+            is_passive: false,
+            failure: None,
+        };
         driver.register_topics()?;
         let slice = driver.config.connect_timeout / N_FIRST_WAITS;
         for _ in 0..N_FIRST_WAITS {
             if driver.receive(slice)? {
+                driver.first_stamp_s = driver.newest.stamp_s;
                 return Ok(driver);
             }
         }
@@ -275,7 +219,7 @@ impl KinovaRosDriver {
         })
     }
 
-    /// Receives all waiting messages, and waits once if they complete no state. Returns whether there is a new state.
+    /// Receives all waiting messages, and waits once if they complete no state. Returns true if there is a new state.
     fn receive(&mut self, timeout: Duration) -> Result<bool, DriverError> {
         if self.drain()? {
             return Ok(true);
@@ -314,7 +258,7 @@ impl KinovaRosDriver {
         self.call_service(arm, Service::Stop)
     }
 
-    /// Forwards a command to an arm. Returns whether its velocities were published.
+    /// Forwards a command to an arm. Returns true if its velocities were published.
     fn drive(
         &mut self,
         arm: usize,
@@ -336,7 +280,7 @@ impl KinovaRosDriver {
         }
     }
 
-    /// Publishes velocities, or a goal of the fingers. Returns whether it published velocities.
+    /// Publishes velocities, or a goal of the fingers. Returns true if it published velocities.
     fn publish(
         &mut self,
         arm: usize,
@@ -380,9 +324,11 @@ impl KinovaRosDriver {
         PairState { newest_command: Some(newest), ..self.newest.clone() }
     }
 
+    /// Returns an identifier that no call or goal of this or an earlier connection has. Nodes outlive connections, and
+    /// actionlib ignores a goal whose identifier it knows.
     fn next_id(&mut self) -> String {
         self.n_ids += 1;
-        format!("tandem-{}", self.n_ids)
+        format!("tandem-{:.6}-{}", self.first_stamp_s, self.n_ids)
     }
 }
 
@@ -427,7 +373,7 @@ impl Driver for KinovaRosDriver {
         self.unless_failed(|_| Err::<(), _>(reason.clone())).ok();
     }
 
-    /// Returns whether every node has answered the call of `in/stop`.
+    /// Returns true if every node has answered the call of `in/stop`.
     fn confirms_stop(&self) -> bool {
         self.failure.is_none() && self.arms.iter().all(|arm| arm.control == Control::Stopped)
     }

@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use crate::driver::{Command, Driver, DriverError, Order, PairState};
 use crate::quarc::codec::STATE_BYTES;
-use crate::quarc::state_buffer::{StateBuffer, keep_faults};
+use crate::quarc::state_buffer::{StateBuffer, keep_peaks};
 
 pub mod arm_side;
 pub mod codec;
@@ -88,7 +88,7 @@ pub struct QuarcDriver {
     n_partial: u32,
     /// The number of the newest command that was sent.
     number: u64,
-    /// Whether an order to stop was exchanged over this connection.
+    /// True if an order to stop was exchanged over this connection.
     stopped_once: bool,
     /// The error that ended the connection.
     failure: Option<DriverError>,
@@ -185,7 +185,7 @@ impl QuarcDriver {
         }
     }
 
-    /// Receives all waiting bytes, and waits once if they complete no state. Returns whether there is a new state.
+    /// Receives all waiting bytes, and waits once if they complete no state. Returns true if there is a new state.
     fn receive(&mut self, timeout: Duration) -> Result<bool, DriverError> {
         if self.drain()? {
             return Ok(true);
@@ -206,7 +206,7 @@ impl QuarcDriver {
         }
     }
 
-    /// Reads all bytes that have arrived. Returns whether they completed a state.
+    /// Reads all bytes that have arrived. Returns true if they completed a state.
     fn drain(&mut self) -> Result<bool, DriverError> {
         let (mut buffer, mut n_taken, mut new) = ([0; 16 * STATE_BYTES], 0, None);
         loop {
@@ -217,7 +217,7 @@ impl QuarcDriver {
                     let before = new.take();
                     new = match (self.buffered.push(&buffer[..n])?, before) {
                         (Some(mut state), Some(before)) => {
-                            keep_faults(&mut state, &before);
+                            keep_peaks(&mut state, &before);
                             Some(state)
                         }
                         (state, before) => state.or(before),
@@ -317,7 +317,7 @@ fn first_state(
     Err(DriverError::Malformed { what })
 }
 
-/// Returns whether an error only means that no data has arrived.
+/// Returns true if an error only means that no data has arrived.
 fn is_timeout(error: &std::io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }

@@ -36,7 +36,6 @@ use tonic::{Request, Response, Status, Streaming};
 use crate::cell_file::{ArmTiming, CellFile};
 use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
 use crate::injection::Injector;
-use error::status;
 use messages::{decode_token, token_text};
 use metrics::StopCounter;
 use motion::MotionSpec;
@@ -70,7 +69,7 @@ pub struct Config {
     pub reconnect: Option<Reconnect>,
     /// The cell file of the arms.
     pub cell: CellFile,
-    /// How fast each arm reacts: the measured times, or else those that the driver assumes.
+    /// The times in which each arm reacts: the measured ones, or else those that the driver assumes.
     pub timings: Vec<ArmTiming>,
     /// The name of the cell file; empty for the default cell.
     pub cell_name: String,
@@ -86,7 +85,8 @@ pub struct Config {
 /// stops the arms.
 ///
 /// # Errors
-/// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
+/// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not
+/// confirmed the stop.
 ///
 /// # Panics
 /// Panics if the speed is not in (0, 1].
@@ -144,7 +144,8 @@ impl Bridge {
     /// Serves the arms to the clients that `server_config` admits, and then stops the arms.
     ///
     /// # Errors
-    /// Returns an error if the server fails, the arms' thread has panicked, or the driver hangs.
+    /// Returns an error if the server fails, the arms' thread has panicked, the driver hangs, or the arms have not
+    /// confirmed the stop.
     pub async fn serve(
         self,
         incoming: impl Into<Incoming>,
@@ -253,15 +254,15 @@ impl BridgeService {
 
     /// Replaces a failed driver and waits for good states. The arms do not move.
     async fn replace_driver(&self, reconnect: Reconnect, token: Token) -> Result<(), Error> {
-        let turn = Arc::clone(&self.reconnects).acquire_owned().await;
-        let turn = turn.map_err(|_closed| Error::ShuttingDown)?;
+        let permit = Arc::clone(&self.reconnects).acquire_owned().await;
+        let permit = permit.map_err(|_closed| Error::ShuttingDown)?;
         self.arms.run(move |arms, now_s| arms.executor.renew(token, now_s)).await?;
         if !self.arms.newest().exchange_failed {
             return Ok(());
         }
-        // The turn ends with the connection, also if the client does not wait for it.
+        // The permit ends with the connection, also if the client does not wait for it.
         let connect = move || {
-            let _turn = turn;
+            let _permit = permit;
             reconnect()
         };
         let connected = tokio::task::spawn_blocking(connect).await;
@@ -295,15 +296,15 @@ impl BridgeService {
         spec: MotionSpec,
         then: impl FnOnce(CheckedMotion) -> T + Send + 'static,
     ) -> Result<T, Error> {
-        let turn = tokio::time::timeout(CHECK_TIMEOUT, Arc::clone(&self.checks).acquire_owned());
-        let turn =
-            turn.await.map_err(|_elapsed| Error::Busy)?.map_err(|_closed| Error::ShuttingDown)?;
+        let permit = tokio::time::timeout(CHECK_TIMEOUT, Arc::clone(&self.checks).acquire_owned());
+        let permit = permit.await.map_err(|_elapsed| Error::Busy)?;
+        let permit = permit.map_err(|_closed| Error::ShuttingDown)?;
         // After an invalid state, which stops the arms, there is none until the next one arrives.
         let newest = self.arms.wait_until(|newest| newest.state.is_some()).await;
         let state = newest.state.clone().ok_or(Error::NoState)?;
         let checker = self.arms.checker.clone();
         let checking = tokio::task::spawn_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             spec.prepare(&state, newest.openings.as_deref(), &checker).map(then)
         });
         Ok(checking.await.map_err(|_panic| Error::Panicked)??)
@@ -403,8 +404,7 @@ impl BridgeRpc for BridgeService {
         &self,
         request: Request<pb::AcquireRequest>,
     ) -> Result<Response<pb::AcquireResponse>, Status> {
-        let acquired = self.acquire_lease(&request.get_ref().token).await;
-        let token = token_text(acquired.map_err(|error| status(&error))?);
+        let token = token_text(self.acquire_lease(&request.get_ref().token).await?);
         let lease_s = self.arms.checker.settings().lease_s;
         Ok(Response::new(pb::AcquireResponse { token, lease_s }))
     }
@@ -413,8 +413,7 @@ impl BridgeRpc for BridgeService {
         &self,
         request: Request<pb::ReleaseRequest>,
     ) -> Result<Response<pb::ReleaseResponse>, Status> {
-        let released = self.release_lease(&request.get_ref().token).await;
-        released.map_err(|error| status(&error))?;
+        self.release_lease(&request.get_ref().token).await?;
         Ok(Response::new(pb::ReleaseResponse {}))
     }
 
@@ -422,8 +421,7 @@ impl BridgeRpc for BridgeService {
         &self,
         request: Request<pb::ResetRequest>,
     ) -> Result<Response<pb::ResetResponse>, Status> {
-        let reset = self.reset_arms(&request.get_ref().token).await;
-        reset.map_err(|error| status(&error))?;
+        self.reset_arms(&request.get_ref().token).await?;
         Ok(Response::new(pb::ResetResponse {}))
     }
 
@@ -431,8 +429,7 @@ impl BridgeRpc for BridgeService {
         &self,
         request: Request<pb::CheckRequest>,
     ) -> Result<Response<pb::CheckResponse>, Status> {
-        let verdict = self.check_request(request.into_inner()).await;
-        verdict.map(Response::new).map_err(|error| status(&error))
+        Ok(Response::new(self.check_request(request.into_inner()).await?))
     }
 
     async fn execute(
@@ -441,15 +438,14 @@ impl BridgeRpc for BridgeService {
     ) -> Result<Response<Self::ExecuteStream>, Status> {
         let client = ConnectInfo::peer(request.extensions()).map(|peer| peer.to_string());
         let client = client.unwrap_or_default();
-        let reports = execute_stream::begin(self, request.into_inner(), client).await;
-        reports.map(Response::new).map_err(|error| status(&error))
+        Ok(Response::new(execute_stream::begin(self, request.into_inner(), client).await?))
     }
 
     async fn stop(
         &self,
         _: Request<pb::StopRequest>,
     ) -> Result<Response<pb::StopResponse>, Status> {
-        let newest = self.arms.stop().await.map_err(|error| status(&error))?;
+        let newest = self.arms.stop().await?;
         let stopped = newest.stopped.as_ref().map(messages::stop);
         Ok(Response::new(pb::StopResponse { stopped }))
     }
@@ -465,8 +461,7 @@ impl BridgeRpc for BridgeService {
         &self,
         request: Request<pb::InjectRequest>,
     ) -> Result<Response<pb::InjectResponse>, Status> {
-        let injected = self.inject_fault(request.into_inner());
-        let injected = injected.map_err(|error| status(&error))?;
+        let injected = self.inject_fault(request.into_inner())?;
         Ok(Response::new(pb::InjectResponse { injected }))
     }
 }

@@ -87,7 +87,7 @@ pub struct Operator<'a> {
     pub announce: &'a mut dyn FnMut(&Motion),
     /// Receives the progress of the motion, once per period.
     pub report: &'a mut dyn FnMut(Progress),
-    /// Returns whether the arms have to stop. Called once per period.
+    /// Returns true if the arms have to stop. Called once per period.
     pub is_interrupted: &'a dyn Fn() -> bool,
 }
 

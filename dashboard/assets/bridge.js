@@ -1,5 +1,7 @@
 // The operator page of a bridge.
-import { byId, clock, el, fetchJson, follow, isNumber, percent, setText, showTable, svg } from "/assets/common.js";
+import {
+  byId, clock, Documents, follow, isNumber, percent, setText, showLog, showTable, showTiles, svg,
+} from "/assets/common.js";
 
 /** Age of the newest state from which the page says that it is old, milliseconds. */
 const STALE_MS = 1500;
@@ -12,8 +14,8 @@ const Z = [-0.07, 0.62];
 /** Least distance from the bases to the edges of the views, along x and y, metres. */
 const MARGINS = [0.16, 0.3];
 
+const documents = new Documents();
 let state = null;
-let logVersion = null;
 let link = "connecting";
 /** Time of the stop that the page shows as confirmed, seconds since the start of the bridge; null if it shows none. */
 let confirmedAt_s = null;
@@ -115,26 +117,12 @@ function tiles(s) {
   return [
     ["Owner", isNumber(s.lease_left_s) ? "a client" : "none",
       isNumber(s.lease_left_s) ? `lease for ${s.lease_left_s.toFixed(1)} s` : "free for any client", false],
-    ["Joints", s.at_rest ? "at rest" : "moving", s.is_connected ? "driver connected" : "driver not connected", false],
+    ["Joints", s.arms.length === 0 ? "unknown" : s.at_rest ? "at rest" : "moving", s.is_connected ? "driver connected" : "driver not connected", false],
     ...faults,
     ...(s.injected.length ? [["Drill", s.injected.join("; "), "injected faults; clear them with tandem bridge inject --clear", true]] : []),
     ["Between arms", mm(s.arms_gap_m), `stopped below ${mm(s.terms.arms_gap_m)}`, isBelow(s.arms_gap_m, 1.25 * s.terms.arms_gap_m)],
     ...arms,
   ];
-}
-
-function showTiles(s) {
-  const parent = byId("tiles");
-  const wanted = tiles(s);
-  while (parent.children.length > wanted.length) parent.lastChild.remove();
-  wanted.forEach(([name, value, detail, isBad], idx) => {
-    const tile = parent.children[idx] ?? parent.appendChild(
-      el("div", { class: "tile" }, el("dt"), el("dd", { class: "value" }), el("dd", { class: "detail" })));
-    tile.classList.toggle("bad", isBad);
-    setText(tile.children[0], name);
-    setText(tile.children[1], value);
-    setText(tile.children[2], detail);
-  });
 }
 
 function showStop(s) {
@@ -210,22 +198,6 @@ function showJoints(s) {
   showTable(byId("joint-table"), ["", ...joints.map((joint) => `joint ${joint + 1}`)], rows);
 }
 
-const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
-
-async function showLog(version) {
-  if (version === logVersion) return;
-  const former = logVersion;
-  logVersion = version;
-  try {
-    const events = await fetchJson("/data/log");
-    if (logVersion !== version) return;
-    byId("log").replaceChildren(...[...events].reverse().map((event) => el("li", {}, el("time", {}, time(event.unix_ms)),
-      el("span", { class: `mark ${event.level}`, "aria-hidden": "true" }, MARKS[event.level]), el("span", {}, event.text))));
-  } catch {
-    if (logVersion === version) logVersion = former;
-  }
-}
-
 function show(s) {
   // The message about a stop disappears with the reset that ends it, even if no state with that stop has arrived.
   const wasStopped = Boolean(state?.stop) || (confirmedAt_s !== null && s.time_s > confirmedAt_s);
@@ -237,11 +209,11 @@ function show(s) {
   }
   showHeader(s);
   showMotion(s);
-  showTiles(s);
+  showTiles(byId("tiles"), tiles(s));
   showStop(s);
   showArms(s);
   showJoints(s);
-  showLog(s.versions.log);
+  documents.update("log", s.versions.log, (events) => showLog(byId("log"), events, (event) => time(event.unix_ms)));
 }
 
 function showLink() {
@@ -261,7 +233,7 @@ function showLink() {
 
 const { ageOfState } = follow(show, (condition) => {
   // A bridge that starts again may begin with other versions.
-  if (condition === "live") logVersion = null;
+  if (condition === "live") documents.forget();
   if (condition === "lost") document.title = "No connection – Tandem bridge";
   link = condition;
   showLink();

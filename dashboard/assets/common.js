@@ -210,11 +210,12 @@ export function showTable(table, names, rows) {
 /** Number of characters that fit a tile in its large font. */
 const MAX_LARGE_CHARS = 9;
 
-/** Shows tiles: [[name, value, detail]]. */
+/** Shows tiles: [[name, value, detail, isBad]]. */
 export function showTiles(parent, tiles) {
   keyed(parent, tiles, ([name]) => name,
     ([name]) => el("div", { class: "tile" }, el("dt", {}, name), el("dd", { class: "value" }), el("dd", { class: "detail" })),
-    (tile, [, value, detail]) => {
+    (tile, [, value, detail, isBad = false]) => {
+      tile.classList.toggle("bad", isBad);
       setText(tile.children[1], value);
       tile.children[1].classList.toggle("long", value.length > MAX_LARGE_CHARS);
       setText(tile.children[2], detail);
@@ -224,11 +225,11 @@ export function showTiles(parent, tiles) {
 export const MARKS = { info: "•", good: "✓", warning: "!", bad: "✕" };
 export const mark = (level) => el("span", { class: `mark ${level}`, "aria-hidden": "true" }, MARKS[level]);
 
-/** Shows events, latest first. */
-export function showLog(parent, events) {
+/** Shows events, latest first. `timeOf` returns the time of an event as text. */
+export function showLog(parent, events, timeOf = (event) => clock(event.at_s)) {
   const items = [...(events ?? [])].reverse();
   parent.replaceChildren(...items.map((event) =>
-    el("li", {}, el("time", {}, clock(event.at_s)), mark(event.level), el("span", {}, event.text))));
+    el("li", {}, el("time", {}, timeOf(event)), mark(event.level), el("span", {}, event.text))));
 }
 
 /** Fetches the documents of a state as they change. */

@@ -1,4 +1,4 @@
-//! Who may see a page, and the headers that keep other pages of the same browser out.
+//! The access to a page, and the headers that keep other pages of the same browser out.
 //!
 //! A page that needs no token is protected by the address that it listens on. Two attacks of other web pages in the
 //! viewer's browser remain: a name that is rebound to that address, which the check of `Host` refuses, and a request to
@@ -33,7 +33,7 @@ pub struct Access {
     token: Option<Token>,
     /// Hexadecimal digest of the token, which browsers keep instead of it.
     cookie: String,
-    /// Whether names without a dot, as containers and machines of a local network have, are valid hosts.
+    /// True if names without a dot, as containers and machines of a local network have, are valid hosts.
     allows_short_names: bool,
 }
 
@@ -58,14 +58,14 @@ impl Access {
         Self { token: Some(token), cookie, allows_short_names: true }
     }
 
-    /// Returns whether the request may be answered.
+    /// Returns true if the request may be answered.
     fn admits(&self, headers: &HeaderMap) -> bool {
         let Some(token) = &self.token else { return true };
         let header = headers.get(AUTHORIZATION).is_some_and(|sent| token.matches(sent.as_bytes()));
         header || headers.get_all(COOKIE).iter().any(|cookies| self.is_in(cookies))
     }
 
-    /// Returns whether the digest of the token is among the cookies.
+    /// Returns true if the digest of the token is among the cookies.
     fn is_in(&self, cookies: &HeaderValue) -> bool {
         let Ok(cookies) = cookies.to_str() else { return false };
         let expected = self.cookie_pair();
@@ -81,8 +81,8 @@ impl Access {
         format!("tandem-{}={}", self.cookie.get(..8).unwrap_or_default(), self.cookie)
     }
 
-    /// Returns whether a browser that sends this `Host` can have come here without a name of a stranger. A cookie is not
-    /// sent to such names, so a token needs no check.
+    /// Returns true if a browser that sends this `Host` can have come here without a name of a stranger. A cookie is
+    /// not sent to such names, so a token needs no check.
     fn allows_host(&self, headers: &HeaderMap) -> bool {
         if self.token.is_some() {
             return true;
@@ -152,7 +152,7 @@ fn refusal(access: &Access, request: &Request<Body>) -> Option<Response> {
     Some((StatusCode::UNAUTHORIZED, text).into_response())
 }
 
-/// Returns whether a request that acts was sent by this page's script, or by a program that is no browser.
+/// Returns true if a request that acts was sent by this page's script, or by a program that is no browser.
 fn is_from_own_page(headers: &HeaderMap) -> bool {
     let text = |name| headers.get(name).and_then(|value: &HeaderValue| value.to_str().ok());
     let own = text(HOST).unwrap_or_default();
@@ -172,7 +172,7 @@ fn without_port(host: &str) -> &str {
     }
 }
 
-/// Returns whether no name server answers for `name`: it is an address, or `localhost`.
+/// Returns true if no name server answers for `name`: it is an address, or `localhost`.
 fn is_local_name(name: &str) -> bool {
     name.parse::<IpAddr>().is_ok()
         || name.parse::<Ipv6Addr>().is_ok()

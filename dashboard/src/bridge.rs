@@ -9,14 +9,11 @@ use tandem_telemetry::{ArmsEvents, ArmsView, LogLevel, StopView};
 use tokio::sync::watch;
 
 use crate::document::encode;
-use crate::events::Level;
+use crate::events::{Level, forget_old};
 use crate::page;
 use crate::site::{Frame, Site, StopAction};
 
-/// Number of events that are kept.
-const KEPT: usize = 60;
-
-/// What does not change while a bridge runs.
+/// The values that do not change while a bridge runs.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct BridgeTerms {
     /// Name of the driver.
@@ -121,8 +118,7 @@ impl Feed {
                 level: level_of(level, &text),
                 text,
             }));
-            let n_old = self.kept.len().saturating_sub(KEPT);
-            self.kept.drain(..n_old);
+            forget_old(&mut self.kept, |it| matches!(it.level, Level::Info | Level::Good));
             self.n_updates += 1;
             self.log = Some(encode(&self.kept));
         }
@@ -172,6 +168,29 @@ mod tests {
     use tandem_telemetry::ArmsPhase;
 
     use super::*;
+    use crate::events::KEPT;
+
+    #[test]
+    fn motions_displace_no_stop() {
+        let mut feed = Feed::default();
+        let stop = StopView {
+            name: "tracking".to_owned(),
+            sentence: "at 3.000 s arm 0 joint 1: 2.86 degrees from the motion's reference"
+                .to_owned(),
+            time_s: 3.0,
+        };
+        let mut view = ArmsView { stop: Some(stop), is_connected: true, ..ArmsView::default() };
+        feed.frame(&view);
+        (view.stop, view.phase) = (None, ArmsPhase::Idle);
+        for n_motions in 1..=KEPT as u64 {
+            (view.n_motions, view.phase) = (n_motions, ArmsPhase::Moving);
+            feed.frame(&view);
+            view.phase = ArmsPhase::Idle;
+            feed.frame(&view);
+        }
+        let n_stops = feed.kept.iter().filter(|it| it.text.starts_with("stopped: ")).count();
+        assert_eq!((n_stops, feed.kept.len()), (1, KEPT + 1));
+    }
 
     #[test]
     fn the_last_stop_stays_after_a_reset_and_events_are_kept() {

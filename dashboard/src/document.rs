@@ -8,7 +8,7 @@ use serde::Serialize;
 #[derive(Debug, Clone)]
 pub(crate) struct Document {
     text: Arc<str>,
-    /// Where each row of a growing list begins in the text. Pages fetch the rows that they lack.
+    /// The beginning of each row of a growing list in the text. Pages fetch the rows that they lack.
     rows: Option<Arc<[usize]>>,
 }
 

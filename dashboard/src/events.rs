@@ -6,8 +6,8 @@ use serde::Serialize;
 use tandem_core::text::counted;
 use tandem_telemetry::{EndView, MetricsRow, RunView, TeacherState, WorkerState, WorkerView};
 
-/// Number of events of level `Info` that are kept, and number of all others.
-const KEPT: usize = 60;
+/// Number of routine events that are kept, and number of all others.
+pub(crate) const KEPT: usize = 60;
 /// Largest number of workers that events name at a time.
 const MAX_NAMED: usize = 4;
 
@@ -60,28 +60,28 @@ impl EventLog {
         for (level, text) in new {
             self.events.push_back(Event { at_s: view.wall_s, level, text });
         }
-        self.forget_old();
+        forget_old(&mut self.events, |it| it.level == Level::Info);
         has_new
-    }
-
-    /// Removes the oldest events. Problems are counted separately: a fast run has an evaluation every second, and these
-    /// would displace them.
-    fn forget_old(&mut self) {
-        for is_info in [true, false] {
-            let of_kind = |it: &Event| (it.level == Level::Info) == is_info;
-            let n = self.events.iter().filter(|it| of_kind(it)).count();
-            let mut n_left_out = n.saturating_sub(KEPT);
-            self.events.retain(|it| {
-                let is_left_out = n_left_out > 0 && of_kind(it);
-                n_left_out -= usize::from(is_left_out);
-                !is_left_out
-            });
-        }
     }
 
     /// Returns the events, oldest first.
     pub(crate) const fn events(&self) -> &VecDeque<Event> {
         &self.events
+    }
+}
+
+/// Removes the oldest events. Routine ones are counted separately: a fast run has an evaluation every second, and these
+/// would displace problems.
+pub(crate) fn forget_old<E>(events: &mut VecDeque<E>, is_routine: impl Fn(&E) -> bool) {
+    for routine in [true, false] {
+        let of_kind = |it: &E| is_routine(it) == routine;
+        let n = events.iter().filter(|it| of_kind(it)).count();
+        let mut n_left_out = n.saturating_sub(KEPT);
+        events.retain(|it| {
+            let is_left_out = n_left_out > 0 && of_kind(it);
+            n_left_out -= usize::from(is_left_out);
+            !is_left_out
+        });
     }
 }
 

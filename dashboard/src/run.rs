@@ -39,7 +39,7 @@ struct State<'a> {
     n_workers: usize,
     /// Number of workers that take part.
     n_active_workers: usize,
-    /// Whether the learner has episodes of the latest evaluation, also those that cannot be played.
+    /// True if the learner has episodes of the latest evaluation, also those that cannot be played.
     has_episodes: bool,
     versions: Versions,
 }

@@ -26,7 +26,7 @@ pub struct SweepView {
     pub n_jobs: usize,
     /// Seconds since this start of the sweep.
     pub wall_s: f64,
-    /// How the sweep ended, or an empty text.
+    /// The end of the sweep, or an empty text.
     pub end: String,
     /// All runs, in the order in which they are started.
     pub runs: Vec<SweepRunView>,
@@ -39,13 +39,13 @@ pub struct SweepRunView {
     pub name: String,
     /// Name of the task.
     pub task: String,
-    /// What the run has in common with those of other seeds: its strategy and varied settings.
+    /// The properties that the run shares with those of other seeds: its strategy and varied settings.
     pub group: String,
     /// Seed of the run.
     pub seed: u64,
-    /// Whether it waits, runs or has ended.
+    /// The state: waiting, running or ended.
     pub state: SweepRunState,
-    /// Why the latest attempt failed, or an empty text.
+    /// The reason why the latest attempt failed, or an empty text.
     pub failure: String,
     /// Success of its best policy on test goals, once it is finished.
     pub result: Option<SweepResult>,
@@ -56,7 +56,7 @@ pub struct SweepRunView {
     /// Environment steps of training.
     #[serde(skip)]
     pub env_steps: u64,
-    /// What changes many times a second while it runs.
+    /// The values that change many times a second while it runs.
     #[serde(skip)]
     pub pace: RunPace,
     /// The evaluations, oldest first.

@@ -29,18 +29,21 @@ _OPTIONS = [
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
 ]
-_CHANNEL_OPTIONS = [
-    *_OPTIONS,
-    # A connection whose other end is gone fails after twenty seconds, also while a stream waits.
+# A connection whose other end is gone or hangs fails after twenty seconds, also while a stream waits.
+_KEEP_ALIVE = [
     ("grpc.keepalive_time_ms", 10_000),
     ("grpc.keepalive_timeout_ms", 10_000),
+    # The time for the answer to a ping. It is a minute by default, whatever the timeout above is.
+    ("grpc.http2.ping_timeout_ms", 10_000),
+]
+_CHANNEL_OPTIONS = [
+    *_OPTIONS,
+    *_KEEP_ALIVE,
     ("grpc.http2.max_pings_without_data", 0),
 ]
 _SERVER_OPTIONS = [
     *_OPTIONS,
-    # The streams of a client that is gone end after twenty seconds.
-    ("grpc.keepalive_time_ms", 10_000),
-    ("grpc.keepalive_timeout_ms", 10_000),
+    *_KEEP_ALIVE,
     # Ports are not shared: a second server on the same port fails.
     ("grpc.so_reuseport", 0),
     # All clients of Tandem probe idle connections; without these the server would close them as too busy.

@@ -215,7 +215,9 @@ class PolicyServer(Server):
         if isinstance(policy, Policy):
             if policy.n_arms != 1:
                 raise ServiceError(f"a teacher's policy drives 1 arm, this one drives {policy.n_arms}")
-            task, digest, batched = task or Task.of_policy(policy), digest or policy.digest, True
+            task, batched = task or Task.of_policy(policy), True
+            # The file's digest does not identify other values.
+            digest = digest or (policy.digest if value is None else None)
             policy, own_value = _functions(policy)
             value = own_value if value is None else value
         if task is None:
@@ -258,7 +260,8 @@ def serve_policy(
       value: a function of observations, goals and actions, shape `[m, n_action]`, that returns values, shape `[m]`;
         without it and without the critic of a policy file, strategies that compare values are not available.
       name: the name of the policy in logs.
-      digest: identifies the policy, 1 to 128 letters, digits, `-`, `_`, `.` and `:`; by default a hash of its answers in 64 fixed states.
+      digest: identifies the policy, 1 to 128 letters, digits, `-`, `_`, `.` and `:`; by default
+        that of its file, or a hash of its answers in 64 fixed states if it is a function or has values of its own.
       batched: whether to evaluate all states of a request at once. By default m is 1, so an answer does not depend on
         the other states of a request, as the last bits of matrix products do.
       token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.

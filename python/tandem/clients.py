@@ -1,8 +1,8 @@
 """Clients of Tandem's services: `Teacher`, `Learner` and `Bridge`.
 
 Addresses are `HOST:PORT` or URIs; a `Learner` also takes a run directory. A call waits up to `timeout_s` for a service
-that is away, and raises `CallError`. Every call may be repeated. Messages are those of
-`proto/proto/tandem/v1`, whose comments describe their fields.
+that is away, and raises `CallError`. Calls may be repeated, except those that begin or end a lease of a bridge or play
+a motion. Messages are those of `proto/proto/tandem/v1`, whose comments describe their fields.
 """
 
 from __future__ import annotations
@@ -48,9 +48,14 @@ __all__ = [
 _TEMPORARY = frozenset({"UNAVAILABLE", "DEADLINE_EXCEEDED", "RESOURCE_EXHAUSTED", "ABORTED", "INTERNAL"})
 _KEEP_ALIVE_S = 0.04
 """Time between two signs of life; the bridge requires one every 0.1 s."""
+_REPORT_S = 5.0
+"""The longest time between two reports of a motion, of which the bridge sends twenty per second."""
+_STOP_S = 4.0
+"""The longest wait for the confirmation of a stop, as in `tandem bridge stop`."""
 _PROBE_S = 1.0
 _STEP_S = 0.04
-_RESET_ATTEMPTS = 11
+_RESET_S = 2.0
+"""Time for which a reset is repeated: behind kinova-ros, ten good states take a second."""
 _RESET_PAUSE_S = 0.1
 
 _ClientT = TypeVar("_ClientT", bound="_Client")
@@ -122,6 +127,8 @@ class _Client:
             code, details = error.code().name, error.details()
             if code == "DEADLINE_EXCEEDED":
                 details = f"no answer within {self._timeout_s:g} s{self._connection_failure()}"
+            if code == "UNAVAILABLE":
+                details = f"{details}{self._tls_hint()}"
             # Servers of Tandem and of Python give no other reason for a call that they do not know.
             if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
                 details = self._wrong_service(error)
@@ -143,9 +150,11 @@ class _Client:
             self._channel.unary_unary("/grpc.health.v1.Health/Check")(b"", timeout=_PROBE_S)
         except grpc.RpcError as error:
             if error.code() is grpc.StatusCode.UNAVAILABLE:
-                hint = "; it uses TLS: give tls_ca" if self._is_plain and uses_tls(self._address, _PROBE_S) else ""
-                return f": {error.details()}{hint}"
+                return f": {error.details()}{self._tls_hint()}"
         return ""
+
+    def _tls_hint(self) -> str:
+        return "; it uses TLS: give tls_ca" if self._is_plain and uses_tls(self._address, _PROBE_S) else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -385,8 +394,21 @@ class Bridge(_Client):
         return response
 
     def stop(self) -> bridge_pb2.BridgeStop:
-        """Stops the arms, at any time and without a lease. Returns the first reason since the last reset."""
-        response: bridge_pb2.StopResponse = self._call(self._stub.Stop, bridge_pb2.StopRequest())
+        """Stops the arms, at any time and without a lease. Returns the first reason since the last reset.
+
+        Raises:
+          CallError: if the arms have not confirmed the stop, after four seconds at most. Use the emergency stop then.
+        """
+        limit_s = min(self._timeout_s, _STOP_S)
+        response: bridge_pb2.StopResponse
+        try:
+            response = self._stub.Stop(bridge_pb2.StopRequest(), timeout=limit_s, wait_for_ready=True)
+        except grpc.RpcError as error:
+            code, details = error.code().name, error.details()
+            if code == "DEADLINE_EXCEEDED":
+                details = f"no answer within {limit_s:g} s"
+            what = f"{self._address}: the stop is not confirmed, use the emergency stop: {details}"
+            raise CallError(code, what) from error
         return response.stopped
 
     def check(self, motion: bridge_pb2.MotionRequest) -> bridge_pb2.CheckResponse:
@@ -457,20 +479,20 @@ class Lease:
         self._token = token
 
     def reset(self) -> None:
-        """Releases stopped arms, so that they accept motions. Inspect the arms first.
+        """Releases stopped arms, so that they accept motions. Inspect the arms first. Idle arms stay as they are.
 
-        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to a second.
+        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to two seconds.
         """
         request = bridge_pb2.ResetRequest(token=self._token)
-        for _ in range(_RESET_ATTEMPTS - 1):
+        deadline_s = time.monotonic() + _RESET_S
+        while True:
             try:
                 self._bridge._call(self._bridge._stub.Reset, request)
                 return
             except CallError as error:
-                if error.code != "FAILED_PRECONDITION":
+                if error.code != "FAILED_PRECONDITION" or time.monotonic() >= deadline_s:
                     raise
             time.sleep(_RESET_PAUSE_S)
-        self._bridge._call(self._bridge._stub.Reset, request)
 
     def renew(self) -> None:
         """Renews the lease, which otherwise ends some seconds after the last request."""
@@ -496,7 +518,13 @@ class Lease:
         return progress
 
     def play(self, motion: bridge_pb2.MotionRequest) -> Iterator[bridge_pb2.MotionProgress]:
-        """Plays a motion, and yields about twenty reports per second. If the iterator is closed, the arms stop."""
+        """Plays a motion, and yields about twenty reports per second. If the iterator is closed, the arms stop.
+
+        Raises:
+          CallError: if the bridge refuses the motion, or sends no report within five seconds (for the first one, within
+            `timeout_s`).
+          MotionStopped: if the arms were stopped before the end.
+        """
         ended = threading.Event()
 
         def requests() -> Iterator[bridge_pb2.ExecuteRequest]:
@@ -506,8 +534,10 @@ class Lease:
 
         with self._bridge._errors():
             responses = self._bridge._stub.Execute(requests())
+            limit_s = self._bridge._timeout_s  # As for any call: the bridge checks the motion first.
             try:
-                for response in responses:
+                while (response := self._next_report(responses, limit_s)) is not None:
+                    limit_s = _REPORT_S
                     yield response.progress
                     if response.HasField("outcome"):
                         if response.outcome.HasField("stopped"):
@@ -518,3 +548,28 @@ class Lease:
                 ended.set()
                 responses.cancel()
         raise CallError("UNAVAILABLE", f"{self._bridge._address}: the stream of the motion ended early")
+
+    def _next_report(self, responses: Any, limit_s: float) -> bridge_pb2.ExecuteResponse | None:
+        """Returns the next report, or None after the last one. If none arrives in time, the stream is cancelled."""
+        too_late = threading.Event()
+
+        def cancel() -> None:
+            too_late.set()
+            responses.cancel()
+
+        timer = threading.Timer(limit_s, cancel)
+        timer.daemon = True
+        timer.start()
+        response = None
+        try:
+            response = next(responses, None)
+        except grpc.RpcError:
+            if not too_late.is_set():
+                raise
+        finally:
+            timer.cancel()
+        if too_late.is_set():
+            what = f"no report of the motion within {limit_s:g} s{self._bridge._connection_failure()}"
+            advice = "the arms may be moving: stop them, with the emergency stop if that is not confirmed"
+            raise CallError("DEADLINE_EXCEEDED", f"{self._bridge._address}: {what}; {advice}")
+        return response

@@ -126,15 +126,20 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
             raise ValueError(f"unknown options {sorted(options)}: expected reset_mask")
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}, expected ({self.num_envs},)")
-        if isinstance(seed, (int, np.integer)):
-            seeds: list[int | None] = [int(seed) + idx for idx in range(self.num_envs)]
+        seeds: list[int | None]
+        first = None
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif np.iterable(seed):  # Arrays without dimensions are not.
+            seeds = list(seed)
         else:
-            seeds = [None] * self.num_envs if seed is None else list(seed)
+            first = checked_number("seed", seed)
+            seeds = [first + idx for idx in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seeds has length {len(seeds)}, expected {self.num_envs}")
         for idx, one in enumerate(seeds):
             seeds[idx] = None if one is None else checked_number(f"the seed of environment {idx}", one)
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        super().reset(seed=first)
         if not self._is_seeded and None in seeds:
             drawn = self.np_random.integers(2**63, size=len(seeds)).tolist()
             seeds = [new if one is None else one for one, new in zip(seeds, drawn, strict=True)]

@@ -1,8 +1,10 @@
 """Clients of the built program's services."""
 
+import contextlib
 import pickle
 import shutil
 import subprocess
+import threading
 import time
 
 import pytest
@@ -12,6 +14,8 @@ pytest.importorskip("grpc")
 import numpy as np
 import tandem
 from services import ROOT, program, service
+from tandem._grpc import Server
+from tandem._proto import bridge_pb2, bridge_pb2_grpc
 
 POLICY = str(ROOT / "policies/teacher-push-classic.safetensors")
 HOME = (tandem.WayPoint((-0.10, 0.02, 0.12)), tandem.WayPoint((0.10, -0.02, 0.12)))
@@ -91,6 +95,7 @@ def test_a_motion_is_played_to_its_end():
             try:
                 with bridge.lease() as lease:
                     lease.reset()
+                    lease.reset()  # Idle arms stay as they are.
                     last = lease.move([HOME], speed=1.0)
                 break
             except tandem.ServiceError as error:
@@ -141,6 +146,60 @@ def test_an_injected_fault_is_present_until_it_is_cleared():
             bridge.inject("torque", joint=9)
         assert raised.value.code == "INVALID_ARGUMENT"
         assert bridge.clear() == [] and not bridge.status().injected
+
+
+class HungBridge(bridge_pb2_grpc.BridgeServicer):
+    """A bridge that sends one report of a motion and answers nothing else."""
+
+    def __init__(self):
+        self.ended = threading.Event()
+
+    def Acquire(self, request, context):
+        return bridge_pb2.AcquireResponse(token="token")
+
+    def Release(self, request, context):
+        return bridge_pb2.ReleaseResponse()
+
+    def Execute(self, requests, context):
+        yield bridge_pb2.ExecuteResponse(progress=bridge_pb2.MotionProgress(played_s=0.1))
+        self.ended.wait()
+
+    def Stop(self, request, context):
+        self.ended.wait()
+        return bridge_pb2.StopResponse()
+
+
+@contextlib.contextmanager
+def hung_bridge():
+    """Yields a client of a bridge that hangs."""
+    servicer = HungBridge()
+
+    def add(server):
+        bridge_pb2_grpc.add_BridgeServicer_to_server(servicer, server)
+
+    with Server(add, max_streams=1) as server, tandem.Bridge(server.address, timeout_s=60) as bridge:
+        try:
+            yield bridge
+        finally:
+            servicer.ended.set()
+
+
+def test_a_stop_that_is_not_confirmed_names_the_emergency_stop(monkeypatch):
+    monkeypatch.setattr(tandem.clients, "_STOP_S", 0.2)
+    expected = "the stop is not confirmed, use the emergency stop: no answer within 0.2 s$"
+    with hung_bridge() as bridge, pytest.raises(tandem.CallError, match=expected) as raised:
+        bridge.stop()
+    assert raised.value.code == "DEADLINE_EXCEEDED"
+
+
+def test_a_motion_without_reports_is_an_error(monkeypatch):
+    monkeypatch.setattr(tandem.clients, "_REPORT_S", 0.2)
+    with hung_bridge() as bridge, bridge.lease() as lease:
+        reports = lease.play(tandem.clients.motion([HOME], speed=1.0))
+        assert next(reports).played_s == 0.1
+        with pytest.raises(tandem.CallError, match="no report of the motion within 0.2 s; .* emergency stop") as raised:
+            next(reports)
+    assert raised.value.is_temporary
 
 
 def test_calls_use_tls_and_the_token(tmp_path):

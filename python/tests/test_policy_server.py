@@ -138,6 +138,10 @@ def test_the_digest_changes_with_the_policy():
     assert digest(follow) == digest(follow) != digest(gentle)
     assert digest(follow, value=closeness) != digest(follow)
     assert digest(follow, digest="v1") == "v1"
+    teacher = tandem.load_policy(TEACHER)
+    far = digest(teacher, value=lambda *state: -closeness(*state))
+    assert len({teacher.digest, digest(teacher, value=closeness), far}) == 3
+    assert digest(teacher) == teacher.digest and digest(teacher, value=closeness, digest="v1") == "v1"
 
 
 def test_requests_are_validated():

@@ -62,7 +62,7 @@ def test_environments_that_are_not_reset_automatically_wait_for_a_reset():
     assert truncations.tolist() == [True, False, True]
     with pytest.raises(ValueError, match="environment 0 has no episode"):
         envs.step(actions)
-    observations, _ = envs.reset(seed=4)
+    observations, _ = envs.reset(seed=np.array(4))
     single, _ = tandem.TandemEnv("push", 2).reset(seed=6)
     assert np.array_equal(observations["observation"][2], single["observation"])
 
@@ -121,6 +121,9 @@ def test_a_refused_reset_changes_nothing():
         each._np_random = np.random.default_rng(7)
     for arguments, message in [
         ({"seed": [1]}, "seeds has length 1"),
+        ({"seed": 1.5}, "seed is 1.5, expected an integer"),
+        ({"seed": np.array(1.5)}, r"seed is array\(1.5\), expected an integer"),
+        ({"seed": "12"}, "the seed of environment 0 is '1', expected an integer"),
         ({"seed": [1, 2.5]}, "the seed of environment 1 is 2.5, expected an integer"),
         ({"seed": 2**64 - 1}, "the seed of environment 1 is 18446744073709551616"),
         ({"seed": 3, "options": {"reset_mask": [True]}}, r"reset_mask has shape \(1,\), expected \(2,\)"),

@@ -1,6 +1,7 @@
 //! `tandem bridge move`: executes the motion in a file.
 
 use std::io::IsTerminal as _;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -23,9 +24,11 @@ use crate::{output, signals};
 const KEEP_ALIVE_EVERY: Duration = Duration::from_millis(40);
 /// Timeout of the stream of reports, of which the bridge sends twenty per second.
 const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest wait for the bar's thread at the end of a motion.
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(100);
 /// Seconds between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
-/// What helps when the arms are not where a motion starts, for example after a joint has drifted.
+/// The advice if the arms are not where a motion starts, for example after a joint has drifted.
 const START_HINT: &str = " (without a bridge, `tandem bridge to-start` moves real arms to a start posture; simulated \
     arms are there after a restart of their bridge)";
 
@@ -45,8 +48,8 @@ pub(super) fn play(args: &MoveArgs) -> Result<(), Failed> {
         if let Some(stop) = &status.stopped {
             return Err(stopped(stop));
         }
+        output::message(accepted_line(&accepted));
         let mut display = MotionDisplay::new(&accepted);
-        display.print(&accepted_line(&accepted));
         let token = acquire(&mut client).await?;
         let name = args.file.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let done = execute(&mut client, &token, (name, motion), &mut display).await;
@@ -218,26 +221,27 @@ fn request(request: pb::execute_request::Request) -> pb::ExecuteRequest {
 
 /// The display of a motion: a bar on a terminal, plain lines elsewhere.
 struct MotionDisplay {
-    bar: Option<ProgressBar>,
+    bar: Option<MotionBar>,
     printed_s: f64,
     phase: pb::BridgePhase,
 }
 
 impl MotionDisplay {
     fn new(accepted: &pb::AcceptedMotion) -> Self {
+        let length = millis(accepted.duration_s / accepted.speed);
         let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::new(millis(accepted.duration_s / accepted.speed));
-            let style = ProgressStyle::with_template("[{bar:32}] {msg}");
-            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+            MotionBar::spawn(move |steps| {
+                let style = ProgressStyle::with_template("[{bar:32}] {msg}");
+                let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+                let bar = ProgressBar::new(length).with_style(style);
+                for (played, line) in steps {
+                    bar.set_position(played);
+                    bar.set_message(line);
+                }
+                bar.finish_and_clear();
+            })
         });
         Self { bar, printed_s: f64::NEG_INFINITY, phase: pb::BridgePhase::Unspecified }
-    }
-
-    fn print(&self, line: &str) {
-        match &self.bar {
-            Some(bar) => bar.println(output::escaped(line)),
-            None => output::message(line),
-        }
     }
 
     fn update(&mut self, progress: &pb::MotionProgress) {
@@ -246,18 +250,48 @@ impl MotionDisplay {
         let phase = show::phase(progress.phase());
         let line = format!("{phase} {played_s:.1} of {duration_s:.1} s");
         if let Some(bar) = &self.bar {
-            bar.set_position(millis(played_s));
-            bar.set_message(line);
+            bar.draw(millis(played_s), line);
         } else if progress.phase() != self.phase || played_s >= self.printed_s + PLAIN_EVERY_S {
             (self.phase, self.printed_s) = (progress.phase(), played_s);
-            self.print(&line);
+            output::message(line);
         }
     }
 
     fn close(&mut self) {
         if let Some(bar) = self.bar.take() {
-            bar.finish_and_clear();
+            bar.close();
         }
+    }
+}
+
+/// A bar on a thread of its own: a terminal that is held with Ctrl-S blocks it, and must not delay the keep-alive
+/// messages, without which the arms are stopped.
+struct MotionBar {
+    steps: SyncSender<(u64, String)>,
+    ended: Receiver<()>,
+}
+
+impl MotionBar {
+    /// Starts `draw`, which receives the played time, milliseconds, and a text with every step.
+    fn spawn(draw: impl FnOnce(Receiver<(u64, String)>) + Send + 'static) -> Self {
+        let (steps, received) = sync_channel(1);
+        let (end, ended) = sync_channel(1);
+        std::thread::spawn(move || {
+            draw(received);
+            end.send(()).ok();
+        });
+        Self { steps, ended }
+    }
+
+    fn draw(&self, played: u64, line: String) {
+        // While the terminal is held, steps are not needed: the bar continues with a later one.
+        self.steps.try_send((played, line)).ok();
+    }
+
+    /// Clears the bar, unless the terminal is held.
+    fn close(self) {
+        drop(self.steps);
+        self.ended.recv_timeout(CLOSE_TIMEOUT).ok();
     }
 }
 
@@ -268,4 +302,25 @@ impl MotionDisplay {
 )]
 fn millis(seconds: f64) -> u64 {
     (1e3 * seconds) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_terminal_that_is_held_delays_nothing_else() {
+        let (release, held) = sync_channel::<()>(0);
+        let (shown, drawn) = sync_channel(1);
+        let bar = MotionBar::spawn(move |steps| {
+            held.recv().ok();
+            shown.send(steps.iter().count()).ok();
+        });
+        for played in 0..100 {
+            bar.draw(played, String::new());
+        }
+        bar.close();
+        drop(release);
+        assert_eq!(drawn.recv().ok(), Some(1), "only one step waits");
+    }
 }

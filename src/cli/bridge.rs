@@ -3,7 +3,8 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::{ArgGroup, Args, Subcommand, ValueEnum};
+use clap::builder::Resettable;
+use clap::{ArgGroup, Args, Id, Subcommand, ValueEnum};
 use tandem_bridge::calibration::SPEED_SHARES;
 
 use super::{
@@ -55,7 +56,11 @@ pub(crate) struct BridgeArgs {
     mut_arg("listen", |arg| arg.default_value(ADDRESS)),
     mut_arg("live", |arg| arg.help(LIVE_HELP)),
     mut_arg("dashboard", |arg| arg.help(DASHBOARD_HELP)),
-    mut_arg("dashboard_token_file", |arg| arg.help(TOKEN_HELP))
+    mut_arg("dashboard_token_file", |arg| {
+        // Unlike a run, a bridge may ask for a token at its default address.
+        let needs_no_address = arg.requires(Resettable::<Id>::Reset);
+        needs_no_address.conflicts_with("no_dashboard").help(TOKEN_HELP)
+    })
 )]
 pub(crate) struct BridgeServeArgs {
     #[command(flatten)]
@@ -373,4 +378,21 @@ fn calibration_speed(text: &str) -> Result<f64, String> {
 fn share(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.01..=1.0).contains(share));
     share.ok_or_else(|| "expected a number from 0.01 to 1".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser as _;
+
+    use crate::cli::Cli;
+
+    #[test]
+    fn the_page_at_the_default_address_may_have_a_token_of_its_own() {
+        let accepts =
+            |args: &[&str]| Cli::try_parse_from(["tandem", "bridge"].iter().chain(args)).is_ok();
+        let token = ["--dashboard-token-file", "token"];
+        assert!(accepts(&token));
+        assert!(accepts(&[&["--dashboard", "127.0.0.1:8600"], &token[..]].concat()));
+        assert!(!accepts(&[&["--no-dashboard"], &token[..]].concat()));
+    }
 }

@@ -158,6 +158,13 @@ def a_killed_bridge_leaves_arms_at_rest(rig):
     check(rig.status()["stopped"]["name"] == "not-reset", "the arms start stopped")
 
 
+def a_new_bridge_moves_the_grippers_too(rig):
+    """The nodes know the goals of the killed bridge, and actionlib ignores a goal whose identifier it knows."""
+    play(rig, FIRST_MOTION, [[-0.12, 0.0, 0.095], [0.12, 0.0, 0.095]])
+    for record in rig.records:
+        until("the gripper is half open", lambda: abs(record.last_state()[4] - 3200.0) < 64.0)
+
+
 def a_relay_that_hangs_stops_the_arms(rig):
     mover = rig.with_arms(lambda: rig.moving(0.5))
     at_s = time.monotonic()
@@ -241,6 +248,7 @@ CASES = [
     grippers_move_while_the_arms_rest,
     a_client_stops_the_arms,
     a_killed_bridge_leaves_arms_at_rest,
+    a_new_bridge_moves_the_grippers_too,
     a_relay_that_hangs_stops_the_arms,
     a_killed_relay_stops_the_arms,
     a_killed_node_stops_the_other_arm,

@@ -171,7 +171,7 @@ class Rig:
         def done():
             result = self.tandem("reset")
             assert result.returncode in (0, 75), result.stderr
-            return result.returncode == 0 or "not stopped but Idle" in result.stderr
+            return result.returncode == 0
 
         until("reset", done)
         until("both nodes are started", lambda: all(self.starts()) or self.status()["stopped"])

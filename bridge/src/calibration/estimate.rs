@@ -21,7 +21,7 @@ const EQUAL_ERROR: f64 = 0.25;
 /// Slowest speed from which a stop can be measured, radians per second.
 const LEAST_RADPS: f64 = 0.02;
 
-/// How a joint came to rest.
+/// The braking of a joint after a stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct StopFit {
     /// Time from the stamp of the newest state before the stop until the joint began to brake, seconds.
@@ -30,7 +30,7 @@ pub(super) struct StopFit {
     pub(super) takes_s: f64,
 }
 
-/// Returns the lag of a joint's angles behind its commands, seconds, from the exchanges of a turn out and back: the
+/// Returns the lag of a joint's angles behind its commands, seconds, from the exchanges of a swing out and back: the
 /// slope of the distance between commanded and measured angle over the commanded speed. `None` if nothing moved.
 pub(super) fn lag_s(
     exchanges: &[Exchange],

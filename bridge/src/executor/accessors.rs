@@ -28,7 +28,7 @@ impl<D: Driver> Executor<D> {
         self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))
     }
 
-    /// Returns whether the arms have confirmed the last order to stop with a new state.
+    /// Returns true if the arms have confirmed the last order to stop with a new state.
     #[must_use]
     pub fn stop_is_confirmed(&self) -> bool {
         self.answers.stop_is_confirmed() && self.driver.confirms_stop()
@@ -93,7 +93,7 @@ impl<D: Driver> Executor<D> {
         self.monitor.state()
     }
 
-    /// Returns whether all joints were at rest in the newest state.
+    /// Returns true if all joints were at rest in the newest state.
     #[must_use]
     pub fn at_rest(&self) -> bool {
         self.monitor.at_rest()

@@ -1,4 +1,4 @@
-//! Whether the arms answer: new states arrive, and one of them confirms an order to stop.
+//! The answers of the arms: new states arrive, and one of them confirms an order to stop.
 
 use crate::driver::PairState;
 
@@ -26,7 +26,7 @@ impl Answers {
         self.awaited.get_or_insert(number);
     }
 
-    /// Returns whether no order to stop awaits its confirmation.
+    /// Returns true if no order to stop awaits its confirmation.
     pub(crate) fn stop_is_confirmed(&self) -> bool {
         self.awaited.is_none()
     }

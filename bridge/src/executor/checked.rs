@@ -105,7 +105,7 @@ impl CheckedMotion {
         self.motion
     }
 
-    /// Returns whether the motion was checked for the executor that `checker` belongs to.
+    /// Returns true if the motion was checked for the executor that `checker` belongs to.
     pub(crate) fn passed(&self, checker: &Checker) -> bool {
         Arc::ptr_eq(&self.passed.0, &checker.0)
     }

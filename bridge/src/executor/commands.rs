@@ -104,7 +104,7 @@ impl CommandHistory {
         }
     }
 
-    /// Returns whether no joint was last commanded to move faster than `rest_radps`.
+    /// Returns true if no joint was last commanded to move faster than `rest_radps`.
     pub(crate) fn at_rest(&self, rest_radps: f64) -> bool {
         self.last.iter().all(|arm| arm.velocities.iter().all(|rate| rate.abs() <= rest_radps))
     }

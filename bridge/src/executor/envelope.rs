@@ -20,7 +20,7 @@ use tandem_kinematics::{Excess, ForwardKinematics, Joints, PlacedArm, WorkCell};
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::commands::VelocityHistory;
 use crate::executor::settings::Settings;
-use crate::executor::stop::{Breach, StopCause};
+use crate::executor::stop::{LocatedCause, StopCause};
 
 /// Relative slack for rounding.
 const ROUNDING: f64 = 1e-9;
@@ -84,7 +84,7 @@ impl Envelope {
         history: &VelocityHistory,
         state: &PairState,
         stale_s: f64,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         for (arm, command) in commands.iter().enumerate() {
             self.check_numbers(arm, command, history.front().map(|velocities| &velocities[arm]))?;
             self.check_tool(arm, command, &state.arms[arm].angles)?;
@@ -111,7 +111,7 @@ impl Envelope {
         arm: usize,
         command: &ArmCommand,
         before: Option<&Joints>,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         let joints = self.cell.arms[arm].model.joints;
         if command.velocities.len() != joints.len()
             || !command.velocities.is_finite()
@@ -136,7 +136,12 @@ impl Envelope {
         Ok(())
     }
 
-    fn check_tool(&self, arm: usize, command: &ArmCommand, at: &Joints) -> Result<(), Breach> {
+    fn check_tool(
+        &self,
+        arm: usize,
+        command: &ArmCommand,
+        at: &Joints,
+    ) -> Result<(), LocatedCause> {
         let posture = ForwardKinematics::new(self.cell.arms[arm].model, at);
         let got = posture.tool_velocity(&command.velocities).norm();
         let allowed = self.settings.check.limits.tool_speed_mps;
@@ -190,7 +195,7 @@ impl Envelope {
         commands.iter().enumerate().map(path).collect()
     }
 
-    fn check_ranges(&self, arm: usize, path: &[Joints]) -> Result<(), Breach> {
+    fn check_ranges(&self, arm: usize, path: &[Joints]) -> Result<(), LocatedCause> {
         for (idx, joint) in self.cell.arms[arm].model.joints.iter().enumerate() {
             let [low, high] = joint.range_rad;
             for angles in path {
@@ -205,7 +210,11 @@ impl Envelope {
     }
 
     /// Checks the gaps on the straight line in joint space between two configurations of all arms.
-    fn check_gaps(&self, [from, to]: &[Vec<Joints>; 2], openings: &[f64]) -> Result<(), Breach> {
+    fn check_gaps(
+        &self,
+        [from, to]: &[Vec<Joints>; 2],
+        openings: &[f64],
+    ) -> Result<(), LocatedCause> {
         let moved_m = |arm: usize| -> f64 {
             let levers = self.levers_m[arm].iter().zip(from[arm].iter().zip(to[arm].iter()));
             levers.map(|(lever_m, (a, b))| lever_m * (b - a).abs()).sum()
@@ -283,7 +292,7 @@ mod tests {
     }
 
     /// Checks velocities in degrees per second that were also the last commands.
-    fn check(at: &[Joints], degrees: [[f64; 4]; 2]) -> Result<(), Breach> {
+    fn check(at: &[Joints], degrees: [[f64; 4]; 2]) -> Result<(), LocatedCause> {
         let velocities = degrees.map(|arm| Joints::new(&arm.map(|rate| rate * DEGREE)));
         let history: VelocityHistory = (0..8).map(|_| velocities.to_vec()).collect();
         check_after(at, velocities, &history)
@@ -293,7 +302,7 @@ mod tests {
         at: &[Joints],
         velocities: [Joints; 2],
         history: &VelocityHistory,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         let envelope = Envelope::new(&mico_cell(), &Settings::default(), PERIOD_S);
         let commands = velocities.map(|velocities| ArmCommand { velocities, opening: 0.5 });
         envelope.check(&commands, history, &state(at), 0.0)
@@ -321,11 +330,12 @@ mod tests {
             let towards = rate * DEGREE / 20.0;
             at[1][2] = end - (way_deg + 0.01) * towards;
             let gaps = check(&at, [REST, [0.0, 0.0, rate, 0.0]]);
-            let is_range = |breach: &Breach| matches!(breach.cause, StopCause::JointRange(_));
+            let is_range =
+                |located: &LocatedCause| matches!(located.cause, StopCause::JointRange(_));
             assert!(!gaps.as_ref().is_err_and(is_range), "{gaps:?}");
             at[1][2] = end - (way_deg - 0.01) * towards;
-            let breach = check(&at, [REST, [0.0, 0.0, rate, 0.0]]).unwrap_err();
-            assert!(is_range(&breach) && breach.joint == Some(2), "{breach:?}");
+            let located = check(&at, [REST, [0.0, 0.0, rate, 0.0]]).unwrap_err();
+            assert!(is_range(&located) && located.joint == Some(2), "{located:?}");
         }
     }
 
@@ -342,9 +352,9 @@ mod tests {
                     // What passes has room for four periods and the braking: 0.02 m/s would not need it.
                     assert!(cell.gaps(&at).table_m[1] > 0.004);
                 }
-                Err(breach) => {
-                    assert!(matches!(breach.cause, StopCause::TableGap(_)), "{breach:?}");
-                    assert_eq!(breach.arm.map(|arm| arm.0), Some(1));
+                Err(located) => {
+                    assert!(matches!(located.cause, StopCause::TableGap(_)), "{located:?}");
+                    assert_eq!(located.arm.map(|arm| arm.0), Some(1));
                     refused += 1;
                 }
             }
@@ -372,8 +382,8 @@ mod tests {
         };
         assert_eq!(check(0.0), Ok(()));
         let [one, other] = [check(20.0), check(-20.0)];
-        let near = |result: &Result<(), Breach>| {
-            result.as_ref().is_err_and(|breach| matches!(breach.cause, StopCause::ArmsGap(_)))
+        let near = |result: &Result<(), LocatedCause>| {
+            result.as_ref().is_err_and(|located| matches!(located.cause, StopCause::ArmsGap(_)))
         };
         assert!(near(&one) != near(&other), "towards each other only: {one:?} {other:?}");
     }
@@ -402,9 +412,9 @@ mod tests {
         let (at, towards) = near_own_base(0.003);
         assert_eq!(check(&at, [REST, REST]), Ok(()));
         assert_eq!(check(&at, [towards.map(|rate| -rate), REST]), Ok(()));
-        let breach = check(&at, [towards, REST]).unwrap_err();
-        assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
-        assert_eq!(breach.arm.map(|arm| arm.0), Some(0));
+        let located = check(&at, [towards, REST]).unwrap_err();
+        assert!(matches!(located.cause, StopCause::SelfGap(_)), "{located:?}");
+        assert_eq!(located.arm.map(|arm| arm.0), Some(0));
         // With room for four periods and the braking it may continue.
         let (at, towards) = near_own_base(0.008);
         assert_eq!(check(&at, [towards, REST]), Ok(()));
@@ -421,8 +431,8 @@ mod tests {
             envelope.check(&[command; 2], &VelocityHistory::new(), &state, 0.0)
         };
         assert_eq!(check(0.4), Ok(()));
-        let breach = check(0.9).unwrap_err();
-        assert!(matches!(breach.cause, StopCause::SelfGap(_)), "{breach:?}");
+        let located = check(0.9).unwrap_err();
+        assert!(matches!(located.cause, StopCause::SelfGap(_)), "{located:?}");
     }
 
     #[test]
@@ -432,20 +442,20 @@ mod tests {
         let still: VelocityHistory = (0..8).map(|_| vec![zero; 2]).collect();
         let from_rest = |rate: f64| {
             let velocities = Joints::new(&[0.0, 0.0, 0.0, rate * DEGREE]);
-            check_after(&at, [velocities, zero], &still).map_err(|breach| breach.cause)
+            check_after(&at, [velocities, zero], &still).map_err(|located| located.cause)
         };
         // 48 degrees/s in 0.25 s are 1.92 degrees/s a period.
         assert_eq!(from_rest(1.91), Ok(()));
         assert!(matches!(from_rest(1.93), Err(StopCause::JointAcceleration(_))));
         assert!(matches!(from_rest(f64::NAN), Err(StopCause::CommandNotFinite)));
-        let breach = check(&at, [REST, [0.0, 0.0, 0.0, 48.1]]).unwrap_err();
-        assert!(matches!(breach.cause, StopCause::JointSpeed(_)) && breach.joint == Some(3));
+        let located = check(&at, [REST, [0.0, 0.0, 0.0, 48.1]]).unwrap_err();
+        assert!(matches!(located.cause, StopCause::JointSpeed(_)) && located.joint == Some(3));
         // Joints 1 to 3 of an outstretched arm at full speed are too fast for the tool.
         let mut far = at.clone();
         far[0][1] = 120.0 * DEGREE;
         far[0][2] = 200.0 * DEGREE;
-        let breach = check(&far, [[36.0, 0.0, 0.0, 0.0], REST]).unwrap_err();
-        assert!(matches!(breach.cause, StopCause::ToolSpeed(_)), "{breach:?}");
+        let located = check(&far, [[36.0, 0.0, 0.0, 0.0], REST]).unwrap_err();
+        assert!(matches!(located.cause, StopCause::ToolSpeed(_)), "{located:?}");
     }
 
     #[test]

@@ -81,7 +81,7 @@ pub enum ResetError {
     /// The client does not own the arms.
     #[error(transparent)]
     Lease(#[from] LeaseError),
-    /// The arms are not stopped.
+    /// A motion is in progress.
     #[error("the arms are not stopped but {0:?}")]
     NotStopped(Phase),
     /// An arm reports a fault, or a torque beyond the limit.
@@ -108,7 +108,7 @@ pub enum ResetError {
     States {
         /// The number of consecutive good states.
         got: u32,
-        /// Why the newest state is not good, if it is not.
+        /// The fault of the newest state, if it has one.
         rejected: Option<StopCause>,
     },
     /// The arms have not confirmed the last order to stop.

@@ -6,7 +6,7 @@ use tandem_kinematics::{ArmModel, Excess, Joints, WorkCell};
 use crate::driver::{ArmReading, PairState};
 use crate::executor::errors::ResetError;
 use crate::executor::settings::Settings;
-use crate::executor::stop::{Breach, StopCause};
+use crate::executor::stop::{LocatedCause, StopCause};
 
 /// A moving joint does not report this many bit-identical angles in a row.
 const MAX_EQUAL_ANGLES: u32 = 4;
@@ -66,7 +66,7 @@ impl Monitor {
 
     /// Returns why the newest state forbids a reset: an arm reports a fault or a torque beyond the limit.
     pub(crate) fn reported(&self) -> Option<ResetError> {
-        let Breach { arm, cause, .. } = self.check_reports(self.state()?).err()?;
+        let LocatedCause { arm, cause, .. } = self.check_reports(self.state()?).err()?;
         Some(ResetError::Reported { arm: arm?, cause })
     }
 
@@ -80,7 +80,7 @@ impl Monitor {
         self.newest.as_ref().map_or(f64::INFINITY, |seen| now_s - seen.at_s - self.period_s)
     }
 
-    /// Returns whether every joint was at rest in the newest state.
+    /// Returns true if every joint was at rest in the newest state.
     pub(crate) fn at_rest(&self) -> bool {
         let rests = |arm: &ArmReading| {
             arm.velocities.iter().all(|rate| rate.abs() <= self.settings.rest_radps)
@@ -94,7 +94,7 @@ impl Monitor {
         now_s: f64,
         state: PairState,
         expected: &ExpectedState<'_>,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         let known = self.newest.as_ref().map(|seen| seen.state.sequence);
         if known == Some(state.sequence) {
             // Arms may report less often than once per period.
@@ -109,7 +109,7 @@ impl Monitor {
                 let reported = self.check_reports(&state);
                 (reported, self.check_measurements(now_s, &state, expected, late_s))
             }
-            Err(breach) => (Ok(()), Err(breach)),
+            Err(cause) => (Ok(()), Err(cause)),
         };
         if measured.is_ok() {
             // Arms that report a fault still report where they are.
@@ -129,7 +129,7 @@ impl Monitor {
     }
 
     /// Checks that the arms report no fault and no torque beyond the limit.
-    fn check_reports(&self, state: &PairState) -> Result<(), Breach> {
+    fn check_reports(&self, state: &PairState) -> Result<(), LocatedCause> {
         for (arm, reading) in state.arms.iter().enumerate() {
             check_faults(arm, reading)?;
             self.check_torques(arm, reading)?;
@@ -145,7 +145,7 @@ impl Monitor {
         state: &PairState,
         expected: &ExpectedState<'_>,
         late_s: f64,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         for (arm, reading) in state.arms.iter().enumerate() {
             self.check_motion(arm, now_s, state.stamp_s, reading)?;
             self.check_frozen(arm, reading, &expected.velocities[arm])?;
@@ -153,7 +153,7 @@ impl Monitor {
         self.check_effect(state, expected.number, late_s)
     }
 
-    fn check_shape(&self, state: &PairState) -> Result<(), Breach> {
+    fn check_shape(&self, state: &PairState) -> Result<(), LocatedCause> {
         let (got, expected) = (state.arms.len(), self.models.len());
         if got != expected {
             return Err(StopCause::Shape { got, expected }.anywhere());
@@ -180,7 +180,7 @@ impl Monitor {
     }
 
     /// Checks sequence number and time stamp. Returns the delay of the state beyond the usual one, seconds.
-    fn check_order(&mut self, now_s: f64, state: &PairState) -> Result<f64, Breach> {
+    fn check_order(&mut self, now_s: f64, state: &PairState) -> Result<f64, LocatedCause> {
         let delay_s = now_s - state.stamp_s;
         if let Some(seen) = &self.newest {
             let expected = seen.state.sequence.wrapping_add(1);
@@ -201,7 +201,7 @@ impl Monitor {
         Ok(got)
     }
 
-    fn check_torques(&self, arm: usize, reading: &ArmReading) -> Result<(), Breach> {
+    fn check_torques(&self, arm: usize, reading: &ArmReading) -> Result<(), LocatedCause> {
         let allowed = self.settings.torque_nm;
         let torques = reading.torques_nm.iter().flat_map(|torques| torques.iter());
         for (joint, torque) in torques.enumerate() {
@@ -222,7 +222,7 @@ impl Monitor {
         now_s: f64,
         stamp_s: f64,
         reading: &ArmReading,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         for (joint, limits) in self.models[arm].joints.iter().enumerate() {
             let allowed = self.settings.overspeed_share * limits.speed_radps;
             let got = reading.velocities[joint].abs();
@@ -247,7 +247,7 @@ impl Monitor {
         arm: usize,
         reading: &ArmReading,
         commanded: &Joints,
-    ) -> Result<(), Breach> {
+    ) -> Result<(), LocatedCause> {
         let before = self.newest.as_ref().map(|seen| seen.state.arms[arm].angles);
         for (joint, commanded_radps) in commanded.iter().enumerate() {
             let angle = reading.angles[joint];
@@ -267,7 +267,12 @@ impl Monitor {
 
     /// Checks that commands take effect in time, if the arms report that. A delayed state cannot reflect the newest
     /// commands.
-    fn check_effect(&self, state: &PairState, number: u64, late_s: f64) -> Result<(), Breach> {
+    fn check_effect(
+        &self,
+        state: &PairState,
+        number: u64,
+        late_s: f64,
+    ) -> Result<(), LocatedCause> {
         let Some(newest) = state.newest_command else { return Ok(()) };
         // A larger number belongs to the command of another client.
         let newest = if newest > number { 0 } else { newest };
@@ -281,7 +286,7 @@ impl Monitor {
     }
 }
 
-fn check_faults(arm: usize, reading: &ArmReading) -> Result<(), Breach> {
+fn check_faults(arm: usize, reading: &ArmReading) -> Result<(), LocatedCause> {
     let faults = reading.faults;
     if faults.emergency_stop {
         Err(StopCause::EmergencyStop.of(arm))

@@ -7,7 +7,7 @@ use tandem_kinematics::{ArmSample, Excess, Joints, Motion, WorkCell};
 use crate::driver::{ArmCommand, PairState};
 use crate::executor::envelope::reachable;
 use crate::executor::settings::Settings;
-use crate::executor::stop::{Breach, StopCause};
+use crate::executor::stop::{LocatedCause, StopCause};
 
 /// Openings that are no further apart than this are equal.
 const OPENING_TOLERANCE: f64 = 1e-6;
@@ -82,7 +82,7 @@ impl Playback {
         &mut self,
         context: &TickContext<'_>,
         paused: bool,
-    ) -> Result<Vec<ArmCommand>, Breach> {
+    ) -> Result<Vec<ArmCommand>, LocatedCause> {
         let errors = match context.state {
             Some(state) => Some(self.errors(context, state)?),
             None => None,
@@ -137,7 +137,11 @@ impl Playback {
     }
 
     /// The tracking errors, radians: the references one lag before the newest state minus the measured angles.
-    fn errors(&self, context: &TickContext<'_>, state: &PairState) -> Result<Vec<Joints>, Breach> {
+    fn errors(
+        &self,
+        context: &TickContext<'_>,
+        state: &PairState,
+    ) -> Result<Vec<Joints>, LocatedCause> {
         let allowed = context.settings.tracking_rad;
         let mut errors = Vec::with_capacity(state.arms.len());
         for (arm, reading) in state.arms.iter().enumerate() {

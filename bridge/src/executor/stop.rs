@@ -142,29 +142,29 @@ pub enum StopCause {
     SelfGap(Excess),
 }
 
-/// A broken limit: a cause and its place, without the time.
+/// The cause of a stop and its place, without the time.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Breach {
+pub(crate) struct LocatedCause {
     pub(crate) arm: Option<ArmIndex>,
     pub(crate) joint: Option<usize>,
     pub(crate) cause: StopCause,
 }
 
 impl StopCause {
-    pub(crate) fn anywhere(self) -> Breach {
-        Breach { arm: None, joint: None, cause: self }
+    pub(crate) fn anywhere(self) -> LocatedCause {
+        LocatedCause { arm: None, joint: None, cause: self }
     }
 
-    pub(crate) fn of(self, arm: usize) -> Breach {
-        Breach { arm: Some(ArmIndex(arm)), joint: None, cause: self }
+    pub(crate) fn of(self, arm: usize) -> LocatedCause {
+        LocatedCause { arm: Some(ArmIndex(arm)), joint: None, cause: self }
     }
 
-    pub(crate) fn of_joint(self, arm: usize, joint: usize) -> Breach {
-        Breach { arm: Some(ArmIndex(arm)), joint: Some(joint), cause: self }
+    pub(crate) fn of_joint(self, arm: usize, joint: usize) -> LocatedCause {
+        LocatedCause { arm: Some(ArmIndex(arm)), joint: Some(joint), cause: self }
     }
 }
 
-impl Breach {
+impl LocatedCause {
     pub(crate) fn at(self, when_s: f64) -> Stop {
         Stop { when_s, arm: self.arm, joint: self.joint, cause: self.cause }
     }

@@ -66,12 +66,12 @@ impl Fingers {
         *self = Self::new(self.settings);
     }
 
-    /// Returns whether a goal is active, so that the arm must receive no velocities.
+    /// Returns true if a goal is active, so that the arm must receive no velocities.
     pub(crate) fn busy(&self) -> bool {
         self.active.is_some()
     }
 
-    /// Returns whether the active goal has had no result for too long. It may still be in the arm's queue.
+    /// Returns true if the active goal has had no result for too long. It may still be in the arm's queue.
     pub(crate) fn is_overdue(&self) -> bool {
         self.active.as_ref().is_some_and(|(_, n)| *n > self.settings.timeout_exchanges)
     }

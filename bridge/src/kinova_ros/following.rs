@@ -1,4 +1,4 @@
-//! Whether an arm follows the velocities that its node received. Pure.
+//! Checks that an arm follows the velocities that its node received. Pure.
 //!
 //! kinova-ros does not report which velocities it has passed on to the arm. Its one thread also reads the arm's state,
 //! with many slow calls, and keeps only the newest velocity meanwhile. The driver's own velocities return through ROS

@@ -40,7 +40,7 @@ pub enum HomingError {
     /// Nothing happened in time.
     #[error("{what} took longer than {limit_s} s")]
     Timeout {
-        /// What took too long.
+        /// The event that took too long.
         what: String,
         /// The limit, seconds.
         limit_s: u32,

@@ -8,8 +8,10 @@ use crate::kinova_ros::protocol::ArmMessage;
 pub(crate) struct StateMerger {
     /// The newest message of each arm.
     newest: Vec<Option<ArmMessage>>,
-    /// Whether each arm has reported since the last state of the pair.
+    /// True for arms that have reported since the last state of the pair, near enough to the other arms.
     new: Vec<bool>,
+    /// True for arms whose newest message no state of the pair contains.
+    is_unseen: Vec<bool>,
     sequence: u64,
     /// Largest difference between the time stamps of one state, seconds.
     skew_s: f64,
@@ -22,16 +24,26 @@ const MAX_SKEWED: u32 = 10;
 
 impl StateMerger {
     pub(crate) fn new(n_arms: usize, skew_s: f64) -> Self {
-        let (newest, new) = (vec![None; n_arms], vec![false; n_arms]);
-        Self { newest, new, sequence: 0, skew_s, n_skewed: 0 }
+        Self {
+            newest: vec![None; n_arms],
+            new: vec![false; n_arms],
+            is_unseen: vec![false; n_arms],
+            sequence: 0,
+            skew_s,
+            n_skewed: 0,
+        }
     }
 
-    /// Adds the message of an arm. Messages that are not newer than the last one are ignored.
-    pub(crate) fn push(&mut self, arm: usize, message: ArmMessage) {
+    /// Adds the message of an arm. Messages that are not newer than the last one are ignored. The largest torques of
+    /// those that no state of the pair contains are kept.
+    pub(crate) fn push(&mut self, arm: usize, mut message: ArmMessage) {
         let known = self.newest[arm].as_ref().map_or(f64::NEG_INFINITY, |newest| newest.stamp_s);
         if message.stamp_s > known {
+            if let Some(before) = self.newest[arm].as_ref().filter(|_| self.is_unseen[arm]) {
+                message.reading.keep_peaks(&before.reading);
+            }
             self.newest[arm] = Some(message);
-            self.new[arm] = true;
+            (self.new[arm], self.is_unseen[arm]) = (true, true);
         }
     }
 
@@ -64,6 +76,7 @@ impl StateMerger {
         self.sequence += 1;
         let arms = messages.iter().map(|message| message.reading.clone()).collect();
         self.new.fill(false);
+        self.is_unseen.fill(false);
         let (sequence, stamp_s) = (self.sequence, oldest_s);
         Ok(Some(PairState { sequence, stamp_s, newest_command: None, arms }))
     }
@@ -108,6 +121,27 @@ mod tests {
         merge.push(1, message(5.02));
         let state = merge.take().unwrap().unwrap();
         assert_eq!((state.sequence, state.stamp_s), (2, 5.02));
+    }
+
+    #[test]
+    fn a_torque_counts_until_a_state_of_the_pair_contains_it() {
+        let with_torque = |stamp_s: f64, torque_nm: f64| {
+            let mut message = message(stamp_s);
+            message.reading.torques_nm = Some(Joints::from_fn(4, |_| torque_nm));
+            message
+        };
+        let mut merge = StateMerger::new(2, 0.1);
+        let mut torque_nm = |reports: [(usize, f64, f64); 3]| {
+            for (arm, stamp_s, torque_nm) in reports {
+                merge.push(arm, with_torque(stamp_s, torque_nm));
+            }
+            merge.take().unwrap().map(|state| state.arms[0].torques_nm.unwrap()[0])
+        };
+        assert_eq!(torque_nm([(0, 5.00, -8.0), (0, 5.01, 1.0), (1, 5.01, 0.0)]), Some(-8.0));
+        assert_eq!(torque_nm([(0, 5.02, 1.0), (0, 5.03, 2.0), (1, 5.03, 0.0)]), Some(2.0));
+        // The first arm's reports are too old for a state of the pair.
+        assert_eq!(torque_nm([(0, 5.04, 1.0), (0, 5.05, 9.0), (1, 5.40, 0.0)]), None);
+        assert_eq!(torque_nm([(0, 5.41, 1.0), (0, 5.42, 2.0), (1, 5.42, 0.0)]), Some(9.0));
     }
 
     #[test]

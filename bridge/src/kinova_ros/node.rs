@@ -24,7 +24,7 @@ pub(crate) struct ArmNode {
     pub(crate) fingers: Fingers,
     /// Numbers and velocities of the commands that were sent and are not published yet; oldest first.
     pub(crate) in_flight: VecDeque<(u64, Joints)>,
-    /// Whether the arm follows the velocities.
+    /// The check that the arm follows the velocities.
     pub(crate) following: Following,
     /// The preparation of a finger goal.
     pub(crate) preparation: Option<Preparation>,
@@ -33,7 +33,7 @@ pub(crate) struct ArmNode {
     pub(crate) mean_efforts: MeanEfforts,
 }
 
-/// Whether a node lets its arm move.
+/// The permission of a node to move its arm.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Control {
     /// No service was called over this connection.

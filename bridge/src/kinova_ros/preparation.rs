@@ -1,4 +1,4 @@
-//! What precedes a goal of the fingers, so that it moves nothing but the fingers.
+//! The steps before a goal of the fingers, so that it moves nothing but the fingers.
 //!
 //! A finger goal is a point in the arm's queue, and the rest of the point is a place for the arm: by its control type
 //! the joint angles or the Cartesian pose of the arm's own last command. After velocities, either may be outdated. The

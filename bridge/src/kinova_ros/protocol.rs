@@ -106,7 +106,7 @@ fn label(number: u64) -> f64 {
     (number % 1000) as f64 * 1e-6
 }
 
-/// Returns whether a message of `kinova_msgs/JointVelocity`, which has single precision, is that of command `number`.
+/// Returns true if a message of `kinova_msgs/JointVelocity`, which has single precision, is that of command `number`.
 pub(crate) fn is_velocity_of(msg: &Value, number: u64, rates: &Joints) -> bool {
     let near = |joint: usize, expected: f64, tolerance: f64| {
         let got = msg.get(format!("joint{joint}")).and_then(Value::as_f64);
@@ -150,7 +150,7 @@ pub(crate) fn joint_degrees(msg: &Value) -> Option<Joints> {
     Some(Joints::new(&degrees.map(f64::to_radians)))
 }
 
-/// Returns whether a goal has succeeded, by the result of its action.
+/// Returns true if a goal has succeeded, by the result of its action.
 pub(crate) fn has_succeeded(msg: &Value) -> bool {
     msg.pointer("/status/status").and_then(Value::as_u64) == Some(3)
 }
@@ -182,7 +182,7 @@ pub(crate) struct ArmDecoder<'a> {
     pub(crate) prefix: &'a str,
     /// The turns of a closed finger.
     pub(crate) shut_turns: f64,
-    /// Whether efforts are torques without the arm's own weight.
+    /// True if efforts are torques without the arm's own weight.
     pub(crate) reports_torques: bool,
 }
 
@@ -288,7 +288,7 @@ mod tests {
     const DECODER: ArmDecoder<'static> =
         ArmDecoder { prefix: "m1n4s200_", shut_turns: 6400.0, reports_torques: false };
 
-    /// What the driver of a `m1n4s200` publishes.
+    /// A state as the driver of a `m1n4s200` publishes it.
     fn joint_state() -> Value {
         let names = ["joint_1", "joint_2", "joint_3", "joint_4"].into_iter().chain([
             "joint_finger_1",

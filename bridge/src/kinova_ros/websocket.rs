@@ -118,7 +118,7 @@ impl RosbridgeSocket {
     }
 }
 
-/// Returns whether an error only means that no data has arrived.
+/// Returns true if an error only means that no data has arrived.
 fn is_timeout(error: &std::io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }

@@ -14,7 +14,7 @@ pub struct ArmSide {
     /// Samples without a new command after which the drives brake.
     silent_limit: u32,
     is_connected: bool,
-    /// Whether the drives have braked by themselves and wait for a stop command (rules 1 and 2).
+    /// True if the drives have braked by themselves and wait for a stop command (rules 1 and 2).
     is_tripped: bool,
     /// Samples since the number of the command changed.
     n_silent: u32,
@@ -89,7 +89,7 @@ impl ArmSide {
         if self.is_tripped { Command { number, order: Order::Stop } } else { self.newest.clone() }
     }
 
-    /// Returns whether the drives have braked by themselves and wait for a stop command.
+    /// Returns true if the drives have braked by themselves and wait for a stop command.
     #[must_use]
     pub const fn is_tripped(&self) -> bool {
         self.is_tripped
@@ -137,7 +137,7 @@ impl VectorSender {
         Ok(true)
     }
 
-    /// Sends the rest. Returns whether nothing is left.
+    /// Sends the rest. Returns true if nothing is left.
     fn flush(&mut self, stream: &mut impl Write) -> io::Result<bool> {
         while !self.rest.is_empty() {
             match stream.write(&self.rest) {

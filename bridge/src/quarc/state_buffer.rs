@@ -12,7 +12,8 @@ pub(crate) struct StateBuffer {
 }
 
 impl StateBuffer {
-    /// Adds received bytes and returns the newest state that they complete, with the faults of all of them.
+    /// Adds received bytes and returns the newest state that they complete, with the faults and the
+    /// largest torques of all of them.
     pub(crate) fn push(&mut self, bytes: &[u8]) -> Result<Option<PairState>, DriverError> {
         self.bytes.extend_from_slice(bytes);
         let (vectors, rest) = self.bytes.as_chunks::<STATE_BYTES>();
@@ -27,7 +28,7 @@ impl StateBuffer {
             }
             self.sequence = Some(state.sequence);
             if let Some(before) = newest.take() {
-                keep_faults(&mut state, &before);
+                keep_peaks(&mut state, &before);
             }
             newest = Some(state);
         }
@@ -41,12 +42,10 @@ impl StateBuffer {
     }
 }
 
-/// Adds the faults of `before` to `state`, which replaces it: one that a single state reports counts too.
-pub(crate) fn keep_faults(state: &mut PairState, before: &PairState) {
+/// Adds the faults and the larger torques of `before` to `state`, which replaces it unseen.
+pub(crate) fn keep_peaks(state: &mut PairState, before: &PairState) {
     for (arm, before) in state.arms.iter_mut().zip(&before.arms) {
-        arm.faults.drive |= before.faults.drive;
-        arm.faults.contact |= before.faults.contact;
-        arm.faults.emergency_stop |= before.faults.emergency_stop;
+        arm.keep_peaks(before);
     }
 }
 
@@ -54,6 +53,7 @@ pub(crate) fn keep_faults(state: &mut PairState, before: &PairState) {
 mod tests {
     use tandem_core::rng::{index, uniform};
     use tandem_core::{Stream, episode_rng};
+    use tandem_kinematics::Joints;
 
     use super::*;
     use crate::driver::Faults;
@@ -97,6 +97,21 @@ mod tests {
         assert_eq!(newest.sequence, 7);
         let contacts: Vec<bool> = newest.arms.iter().map(|arm| arm.faults.contact).collect();
         assert_eq!(contacts, [false, true]);
+    }
+
+    #[test]
+    fn a_torque_of_a_state_that_is_replaced_counts() {
+        let mut states: Vec<PairState> = (5..8).map(state).collect();
+        let torques_nm = [[0.5, -9.0, 1.0, 0.0], [2.0, 3.0, -1.0, 0.0], [-1.0, 4.0, 0.5, 0.0]];
+        for (state, torques_nm) in states.iter_mut().zip(torques_nm) {
+            state.arms[1].torques_nm = Some(Joints::new(&torques_nm));
+        }
+        let sent: Vec<u8> =
+            states.iter().flat_map(|state| to_bytes(&encode_state(state).unwrap())).collect();
+        let newest = StateBuffer::default().push(&sent).unwrap().unwrap();
+        assert_eq!(newest.arms[0].torques_nm, None);
+        assert_eq!(newest.arms[1].torques_nm, Some(Joints::new(&[2.0, -9.0, 1.0, 0.0])));
+        assert_eq!(newest.arms[1].angles, state(7).arms[1].angles);
     }
 
     #[test]

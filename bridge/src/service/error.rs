@@ -80,41 +80,43 @@ pub enum Error {
     Transport(#[from] tonic::transport::Error),
 }
 
-/// Converts an error to the status that clients receive.
-pub(super) fn status(error: &Error) -> Status {
-    let message = error.to_string();
-    match error {
-        Error::Request(_) => Status::invalid_argument(message),
-        Error::Lease(error)
-        | Error::Reset(ResetError::Lease(error))
-        | Error::Start(StartError::Lease(error)) => match error {
-            LeaseError::Held { .. } => Status::permission_denied(message),
-            LeaseError::NotOwned => Status::failed_precondition(message),
-        },
-        Error::Start(StartError::Refused(refusal)) => {
-            // The message does not contain the refusal, which is the error's source.
-            Status::failed_precondition(format!("{message}: {refusal}"))
-        }
-        Error::Reset(_)
-        | Error::Start(_)
-        | Error::Refused(_)
-        | Error::NoState
-        | Error::RealArms { .. } => Status::failed_precondition(message),
-        Error::StreamEnded => Status::cancelled(message),
-        Error::StreamBroken(status) => Status::new(status.code(), message),
-        Error::Busy => Status::resource_exhausted(message),
-        Error::ShuttingDown | Error::Reconnect(_) => Status::unavailable(message),
-        Error::Timeout(_) | Error::StopFailed(_) | Error::StopUnconfirmed(_) => {
-            tracing::error!(%error, "request failed");
-            Status::unavailable(message)
-        }
-        Error::Panicked
-        | Error::DriverHung
-        | Error::Thread(_)
-        | Error::ServerConfig(_)
-        | Error::Transport(_) => {
-            tracing::error!(%error, "request failed");
-            Status::internal(message)
+/// The status that clients receive.
+impl From<Error> for Status {
+    fn from(error: Error) -> Self {
+        let message = error.to_string();
+        match &error {
+            Error::Request(_) => Self::invalid_argument(message),
+            Error::Lease(error)
+            | Error::Reset(ResetError::Lease(error))
+            | Error::Start(StartError::Lease(error)) => match error {
+                LeaseError::Held { .. } => Self::permission_denied(message),
+                LeaseError::NotOwned => Self::failed_precondition(message),
+            },
+            Error::Start(StartError::Refused(refusal)) => {
+                // The message does not contain the refusal, which is the error's source.
+                Self::failed_precondition(format!("{message}: {refusal}"))
+            }
+            Error::Reset(_)
+            | Error::Start(_)
+            | Error::Refused(_)
+            | Error::NoState
+            | Error::RealArms { .. } => Self::failed_precondition(message),
+            Error::StreamEnded => Self::cancelled(message),
+            Error::StreamBroken(status) => Self::new(status.code(), message),
+            Error::Busy => Self::resource_exhausted(message),
+            Error::ShuttingDown | Error::Reconnect(_) => Self::unavailable(message),
+            Error::Timeout(_) | Error::StopFailed(_) | Error::StopUnconfirmed(_) => {
+                tracing::error!(%error, "request failed");
+                Self::unavailable(message)
+            }
+            Error::Panicked
+            | Error::DriverHung
+            | Error::Thread(_)
+            | Error::ServerConfig(_)
+            | Error::Transport(_) => {
+                tracing::error!(%error, "request failed");
+                Self::internal(message)
+            }
         }
     }
 }

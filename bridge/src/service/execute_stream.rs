@@ -11,7 +11,7 @@ use tonic::{Status, Streaming};
 
 use crate::executor::Token;
 use crate::service::BridgeService;
-use crate::service::error::{Error, status};
+use crate::service::error::Error;
 use crate::service::execution::{AbandonOnDrop, Execution, Outcome};
 use crate::service::messages::{self, decode_token};
 use crate::service::snapshot::{MotionInfo, Snapshot};
@@ -126,7 +126,7 @@ async fn run_stream(
             () = responses.closed() => return,
             changed = snapshots.changed() => {
                 if changed.is_err() {
-                    drop(responses.send(Err(status(&Error::ShuttingDown))).await);
+                    drop(responses.send(Err(Error::ShuttingDown.into())).await);
                     return;
                 }
                 let newest = Arc::clone(&snapshots.borrow_and_update());

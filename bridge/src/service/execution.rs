@@ -38,7 +38,7 @@ impl Execution {
         self.alive.store(true, Ordering::Release);
     }
 
-    /// Returns whether the client gave a sign of life since the last call.
+    /// Returns true if the client gave a sign of life since the last call.
     pub(super) fn take_alive(&self) -> bool {
         self.alive.swap(false, Ordering::AcqRel)
     }

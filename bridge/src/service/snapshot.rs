@@ -20,15 +20,15 @@ pub struct Snapshot {
     pub phase: Phase,
     /// The stop that the arms are in, while they are stopped.
     pub stopped: Option<Stop>,
-    /// Whether the last exchange with the arms failed.
+    /// True if the last exchange with the arms failed.
     pub exchange_failed: bool,
     /// The error of the last attempt to stop the drives, until a command gets through.
     pub stop_error: Option<DriverError>,
-    /// Whether the arms have confirmed the last requested stop.
+    /// True if the arms have confirmed the last requested stop.
     pub(super) stop_is_confirmed: bool,
     /// The time until the owner's lease ends unless it is renewed, seconds; `None` if the arms have no owner.
     pub lease_left_s: Option<f64>,
-    /// Whether all joints were at rest in the newest state.
+    /// True if all joints were at rest in the newest state.
     pub at_rest: bool,
     /// The newest valid state of the arms.
     pub state: Option<PairState>,

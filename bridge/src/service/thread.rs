@@ -38,8 +38,8 @@ const MAX_JOBS: u32 = 8;
 const CALL_TIMEOUT: Duration = Duration::from_secs(2);
 /// The longest time in which the arms confirm a stop.
 const CONFIRM_TIMEOUT: Duration = Duration::from_secs(1);
-/// The largest number of ticks in which the arms come to rest when the service shuts down.
-const SHUTDOWN_TICKS: u32 = 50;
+/// The largest number of ticks in which the arms confirm a stop and come to rest when the service shuts down.
+const SHUTDOWN_TICKS: u32 = 100;
 
 type Job = Box<dyn FnOnce(&mut ControlLoop, f64) + Send>;
 
@@ -111,10 +111,10 @@ impl ArmsThread {
             if let Some(prepare) = prepare {
                 prepare();
             }
-            let ticked = catch_unwind(AssertUnwindSafe(|| control.run(&*thread_clock, &ends)));
+            let ended = catch_unwind(AssertUnwindSafe(|| control.run(&*thread_clock, &ends)));
             // Dropping the executor stops the drives, even after a panic.
             let dropped = catch_unwind(AssertUnwindSafe(move || drop(control)));
-            ticked.and(dropped).map_err(|_panic| Error::Panicked)
+            dropped.and(ended).unwrap_or(Err(Error::Panicked))
         })?;
         Ok((
             Self { thread, ended },
@@ -125,7 +125,8 @@ impl ArmsThread {
     /// Waits for the thread's end, at most for `grace`.
     ///
     /// # Errors
-    /// Returns an error if the thread has panicked, or its driver hangs.
+    /// Returns an error if the thread has panicked, its driver hangs, or the arms have not confirmed the stop at its
+    /// end.
     pub(super) async fn join(self, grace: Duration) -> Result<(), Error> {
         match tokio::time::timeout(grace, self.ended).await {
             Ok(_ended) => self.thread.join().unwrap_or(Err(Error::Panicked)),
@@ -135,10 +136,13 @@ impl ArmsThread {
 }
 
 impl ControlLoop {
-    /// Ticks until `ends` is cancelled and the arms are at rest.
-    fn run(&mut self, clock: &dyn Clock, ends: &CancellationToken) {
+    /// Ticks until `ends` is cancelled, and then until the arms have confirmed a stop and are at rest.
+    ///
+    /// # Errors
+    /// Returns an error if they do not confirm it in time.
+    fn run(&mut self, clock: &dyn Clock, ends: &CancellationToken) -> Result<(), Error> {
         let (mut at_s, mut n_shutdown) = (clock.now_s(), 0);
-        while n_shutdown < SHUTDOWN_TICKS {
+        loop {
             at_s = next_time(at_s, self.executor.period_s(), clock.now_s());
             clock.sleep_until(at_s);
             let now_s = clock.now_s();
@@ -148,7 +152,9 @@ impl ControlLoop {
                     self.jobs.close();
                     while self.jobs.try_recv().is_ok() {}
                 } else if self.executor.at_rest() && self.executor.stop_is_confirmed() {
-                    return;
+                    return Ok(());
+                } else if n_shutdown == SHUTDOWN_TICKS {
+                    return Err(self.unconfirmed());
                 }
                 n_shutdown += 1;
             }
@@ -157,6 +163,15 @@ impl ControlLoop {
             self.finish_motion();
             self.publish(now_s);
         }
+    }
+
+    /// Returns the error of a shutdown that the arms have not confirmed.
+    fn unconfirmed(&self) -> Error {
+        if let Some(error) = self.executor.stop_error() {
+            return Error::StopFailed(error.clone());
+        }
+        let waited_s = f64::from(SHUTDOWN_TICKS) * self.executor.period_s();
+        Error::StopUnconfirmed(Duration::from_secs_f64(waited_s))
     }
 
     fn publish(&self, now_s: f64) {

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use tandem_bridge::kinova_ros::{Efforts, KinovaRosConfig, KinovaRosDriver, home, settings};
 use tandem_bridge::service::Clock;
-use tandem_bridge::{DriverError, PairState, Phase, StopCause};
+use tandem_bridge::{
+    ArmCommand, Command, Driver as _, DriverError, Order, PairState, Phase, StopCause,
+};
 use tandem_kinematics::{Joints, Motion};
 
 use crate::drivers::kinova_side::{Fault, Side};
@@ -44,6 +46,13 @@ fn quiet(mut driver: KinovaRosDriver, side: &Side) -> KinovaRosDriver {
     driver
 }
 
+/// Lets time advance on the other side with each exchange.
+fn patient(side: &Side, driver: KinovaRosDriver) -> Patient<KinovaRosDriver> {
+    let waits = Rc::new(Cell::new(false));
+    let (passing, due) = (side.clone(), Rc::clone(&waits));
+    Patient::new(driver, &waits, move || due.set(passing.pass()))
+}
+
 impl Test {
     pub(crate) fn new(openings: [f64; 4]) -> Self {
         let motion = sweep(openings);
@@ -53,10 +62,7 @@ impl Test {
     }
 
     pub(crate) fn with(side: Side, driver: KinovaRosDriver, motion: Motion) -> Self {
-        let waits = Rc::new(Cell::new(false));
-        let (passing, due) = (side.clone(), Rc::clone(&waits));
-        let driver = Patient::new(driver, &waits, move || due.set(passing.pass()));
-        Self { rig: Rig::new(driver, settings()), side, motion }
+        Self { rig: Rig::new(patient(&side, driver), settings()), side, motion }
     }
 
     /// Arms in the middle of the motion.
@@ -201,6 +207,29 @@ fn grippers_move_while_the_arms_are_stationary() {
         assert_eq!((&last["finger2"], last["finger3"].as_f64()), (&last["finger1"], Some(0.0)));
         assert!(node.goals.len() <= 3, "{:?}", node.goals);
         assert_eq!(node.n_while_busy, 0);
+    }
+}
+
+/// The nodes outlive a bridge, and ignore a goal whose identifier they know.
+#[test]
+fn a_second_connection_moves_the_grippers_too() {
+    let side = Side::new(&pair_at(&sweep(STEADY)));
+    let order = |opening| {
+        let arm = ArmCommand { velocities: Joints::from_fn(4, |_| 0.0), opening };
+        Order::Move(vec![arm; 2])
+    };
+    for (n_goals, opening) in [(1, 0.5), (2, 0.2)] {
+        let mut driver = patient(&side, connected(&side));
+        let mut number = 0;
+        // The first opening after a stop moves nothing: the driver takes it for that of the gripper.
+        for (order, n) in [(Order::Stop, 30), (order(0.8), 60), (order(opening), 400)] {
+            for _ in 0..n {
+                number += 1;
+                driver.exchange(&Command { number, order: order.clone() }).unwrap();
+            }
+        }
+        let n_sent = side.ros().nodes.each_ref().map(|node| node.goals.len());
+        assert_eq!(n_sent, [n_goals; 2]);
     }
 }
 

@@ -215,6 +215,11 @@ impl Ros {
         let arm = NODES.iter().position(|node| topic.starts_with(node)).unwrap();
         let name = topic[NODES[arm].len() + 1..].to_owned();
         let node = &mut self.nodes[arm];
+        if let Some(id) = message.pointer("/msg/goal_id/id").and_then(Value::as_str)
+            && !node.goal_ids.insert((name.clone(), id.to_owned()))
+        {
+            return;
+        }
         match (message["op"].as_str().unwrap(), name.as_str()) {
             ("advertise", _) => assert_eq!(message["queue_size"], 1),
             ("subscribe", _) => {
@@ -250,23 +255,25 @@ impl Ros {
                 assert!(node.goal.replace((id.to_owned(), 0)).is_none(), "a goal was replaced");
                 assert!(node.is_angular, "a finger goal with a Cartesian point");
             }
-            ("publish", "joints_action/joint_angles/goal") => {
-                let angle = |joint: usize| {
-                    message["msg"]["goal"]["angles"][format!("joint{}", joint + 1)].as_f64()
-                };
-                let goal = Joints::from_fn(4, |joint| angle(joint).unwrap().to_radians());
-                let at = self.before.as_ref().unwrap().arms[arm].angles;
-                assert!(goal.largest_difference(&at) < 1e-6, "the goal moves the arm");
-                node.is_angular = true;
-                let id = &message["msg"]["goal_id"]["id"];
-                let status = if self.fault == Some(Fault::Aborts) { 4 } else { 3 };
-                let msg = json!({"status": {"goal_id": {"id": id}, "status": status, "text": ""}});
-                let topic = format!("{}/joints_action/joint_angles/result", NODES[arm]);
-                self.say(&json!({"op": "publish", "topic": topic, "msg": msg}));
-            }
+            ("publish", "joints_action/joint_angles/goal") => self.hold_angles(arm, message),
             ("call_service", _) => self.serve(arm, &name, &message["id"]),
             _ => panic!("{message}"),
         }
+    }
+
+    /// Handles a goal of joint angles, which must be those of the arm.
+    fn hold_angles(&mut self, arm: usize, message: &Value) {
+        let angle =
+            |joint: usize| message["msg"]["goal"]["angles"][format!("joint{}", joint + 1)].as_f64();
+        let goal = Joints::from_fn(4, |joint| angle(joint).unwrap().to_radians());
+        let at = self.before.as_ref().unwrap().arms[arm].angles;
+        assert!(goal.largest_difference(&at) < 1e-6, "the goal moves the arm");
+        self.nodes[arm].is_angular = true;
+        let id = &message["msg"]["goal_id"]["id"];
+        let status = if self.fault == Some(Fault::Aborts) { 4 } else { 3 };
+        let msg = json!({"status": {"goal_id": {"id": id}, "status": status, "text": ""}});
+        let topic = format!("{}/joints_action/joint_angles/result", NODES[arm]);
+        self.say(&json!({"op": "publish", "topic": topic, "msg": msg}));
     }
 
     fn serve(&mut self, arm: usize, name: &str, id: &Value) {

@@ -248,6 +248,21 @@ fn a_reset_is_refused_where_the_arms_would_be_stopped_again() {
 }
 
 #[test]
+fn an_owner_may_reset_idle_arms_and_not_moving_ones() {
+    let motion = walk(TASKS, 1, 3);
+    let mut rig = Rig::ready(&motion, config());
+    rig.executor.reset(OWNER, rig.now_s).unwrap();
+    assert_eq!(rig.tick(), Phase::Idle);
+    let reset = rig.executor.reset(STRANGER, rig.now_s);
+    assert!(matches!(reset, Err(ResetError::Lease(LeaseError::Held { .. }))), "{reset:?}");
+    rig.executor.start(OWNER, motion, 1.0, rig.now_s).unwrap();
+    assert_eq!(rig.tick_owned(), Phase::Moving);
+    let reset = rig.executor.reset(OWNER, rig.now_s);
+    assert_eq!(reset, Err(ResetError::NotStopped(Phase::Moving)));
+    assert_eq!(rig.tick_owned(), Phase::Moving);
+}
+
+#[test]
 fn a_reset_after_a_driver_failure_is_refused() {
     let motion = walk(TASKS, 8, 3);
     let mut rig = Rig::ready(&motion, config());

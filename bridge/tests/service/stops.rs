@@ -218,6 +218,20 @@ async fn a_shutdown_stops_the_arms_first() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_shutdown_that_resting_arms_do_not_confirm_is_an_error() {
+    let silent = (Fault::Silent, "the arms have not confirmed it within 1s");
+    for (fault, expected) in [silent, (Fault::Dead, "could NOT be commanded to stop")] {
+        let mut rig = Rig::new(patient()).await;
+        rig.ready().await;
+        rig.tap.fail(fault);
+        rig.shutdown.cancel();
+        drop(rig.client);
+        let error = rig.served.await.unwrap().unwrap_err().to_string();
+        assert!(error.contains(expected) && error.contains("use the emergency stop"), "{error}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_driver_that_fails_stops_the_arms() {
     let mut rig = Rig::new(patient()).await;
     let token = rig.ready().await;

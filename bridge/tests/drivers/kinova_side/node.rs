@@ -1,6 +1,6 @@
 //! An arm's node and the faults of its side.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use serde_json::Value;
 use tandem_bridge::ArmCommand;
@@ -55,6 +55,8 @@ pub(crate) struct Node {
     /// Whether the arm's control type is angular. `in/start` restarts the interface.
     pub(super) is_angular: bool,
     pub(super) goal: Option<(String, u32)>,
+    /// The topics and identifiers of all goals. As actionlib, the node ignores a goal that has a known one.
+    pub(super) goal_ids: BTreeSet<(String, String)>,
     pub(super) homing: bool,
     /// The pending call of `in/start` or `in/home_arm` and the periods until its response.
     pub(super) starting: Option<(Value, u32)>,

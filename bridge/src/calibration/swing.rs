@@ -1,5 +1,6 @@
-//! The turns of a joint that is measured.
+//! The swings of a joint that is measured.
 
+use tandem_core::ArmIndex;
 use tandem_kinematics::{ArmSample, Joints, Motion};
 
 use crate::driver::PairState;
@@ -7,17 +8,21 @@ use crate::driver::PairState;
 /// Time from one sample to the next, seconds.
 const PERIOD_S: f64 = 0.01;
 
-/// How a joint turns: it accelerates, keeps its speed and brakes.
+/// The swing of a joint, which accelerates, keeps its speed and brakes.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Turn {
+pub(super) struct Swing {
+    /// The arm.
+    pub(super) arm: ArmIndex,
+    /// The joint, counted from 0.
+    pub(super) joint: usize,
     /// Largest speed, radians per second.
     pub(super) radps: f64,
     /// Acceleration, radians per second squared.
     pub(super) radps2: f64,
 }
 
-impl Turn {
-    /// Time for which a full turn keeps its speed, seconds.
+impl Swing {
+    /// Time for which a full swing keeps its speed, seconds.
     pub(super) const CONSTANT_S: f64 = 0.3;
 
     /// Time in which the joint reaches its speed, seconds.
@@ -25,20 +30,20 @@ impl Turn {
         self.radps / self.radps2
     }
 
-    /// A full turn, radians.
+    /// A full swing, radians.
     pub(super) fn full_rad(&self) -> f64 {
         self.radps * (Self::CONSTANT_S + self.ramp_s())
     }
 
-    /// The smallest turn that is worth while, radians.
+    /// The smallest swing that is worth while, radians.
     pub(super) fn least_rad(&self) -> f64 {
         0.02 * self.full_rad()
     }
 
-    /// Returns the motion from `state` in which joint `joint` of arm `arm` turns by `by` radians and nothing else moves.
-    pub(super) fn motion(&self, state: &PairState, arm: usize, joint: usize, by: f64) -> Motion {
+    /// Returns the motion from `state` in which the joint turns by `by` radians and nothing else moves.
+    pub(super) fn motion(&self, state: &PairState, by: f64) -> Motion {
         let (side, length) = (by.signum(), by.abs());
-        // A short turn does not reach the speed.
+        // A short swing does not reach the speed.
         let ramp_s = self.ramp_s().min((length / self.radps2).sqrt());
         let radps = self.radps2 * ramp_s;
         let constant_s = (length / radps - ramp_s).max(0.0);
@@ -46,10 +51,10 @@ impl Turn {
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
-            reason = "a turn takes about a second"
+            reason = "a swing takes about a second"
         )]
         let n_intervals = ((duration_s / PERIOD_S).ceil() as usize).max(1);
-        // Samples at whole periods end a little later than the turn: slow it down by as much.
+        // Samples at whole periods end a little later than the swing: slow it down by as much.
         let slower = duration_s / (n_intervals as f64 * PERIOD_S);
         let at = |time_s: f64| {
             let (left_s, peak_s) = (duration_s - time_s, ramp_s + constant_s);
@@ -65,7 +70,7 @@ impl Turn {
             let reading = &state.arms[arm_idx];
             let (turned, radps) =
                 if idx == n_intervals { (length, 0.0) } else { at(idx as f64 * PERIOD_S * slower) };
-            let moves = |other: usize| arm_idx == arm && other == joint;
+            let moves = |other: usize| arm_idx == self.arm.0 && other == self.joint;
             let n_joints = reading.angles.len();
             ArmSample {
                 angles: Joints::from_fn(n_joints, |other| {
