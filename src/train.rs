@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use tandem_core::text::counted;
+use tandem_learner::INTERRUPTED;
 use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -47,8 +48,6 @@ const NOT_SAVED: &str = "the learner did not save within 10 minutes and was kill
 const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// Time between two samples of their memory.
 const SAMPLE_EVERY: Duration = Duration::from_millis(500);
-/// End reason of an interrupted run.
-const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     if args.list_settings {
@@ -269,7 +268,10 @@ impl<'a> Supervisor<'a> {
         if progress.task.is_empty() || (progress.ended && progress.digest.is_empty()) {
             return;
         }
-        self.stream = stream;
+        if is_new_stream {
+            self.stream = stream;
+            self.display.begin_stream();
+        }
         if self.last.task.is_empty() {
             // The learner has loaded its checkpoint, so the run continues.
             self.processes.run_file_is_written();

@@ -99,8 +99,8 @@ fn failure_path(dir: &Path) -> PathBuf {
 const LENGTH: &str = "stop.max_env_steps";
 
 /// The difference of a run whose settings are equal.
-const OTHER_TEACHER: &str = "its teacher is neither that of [teachers] nor, without one, the shipped one (to keep it, name the \
-     run's policy/teacher.* in [teachers])";
+const OTHER_TEACHER: &str = "its teacher is neither that of [teachers] nor, without one, the shipped one (to keep it, name \
+     the run's policy/teacher.* in [teachers])";
 
 /// Returns the state of the run in `dir`, and the length to which it is extended.
 pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
