@@ -7,6 +7,7 @@ mod policy_server;
 mod processes;
 mod progress_stream;
 mod restart_policy;
+mod resume_command;
 pub(crate) mod run_lock;
 mod summary;
 pub(crate) mod teacher_file;
@@ -20,13 +21,12 @@ use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::cli::TrainArgs;
+use crate::cli::{RecordedName, TrainArgs};
 use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::live::LiveRun;
 use crate::progress_json::progress_json;
 use crate::run_display::Display;
-use crate::shell::shell_word;
 use crate::{
     clock, environment_file, environment_server, metrics, output, run_directory, runtime,
     served_task, settings_page, signals,
@@ -35,13 +35,14 @@ use inputs::RunInputs;
 use plan::Plan;
 use processes::{PeakMemory, RunFailure, RunProcesses, Saved};
 use progress_stream::ProgressUpdate;
+use resume_command::resume_command;
 use run_lock::RunLock;
 
 /// Timeout of the start of all processes.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Time that the learner has to finish the updates of a round, save and exit.
 const END_TIMEOUT: Duration = Duration::from_mins(10);
-/// What is printed when that was not enough.
+/// Message if the learner exceeds this timeout.
 const NOT_SAVED: &str = "the learner did not save within 10 minutes and was killed: a resumed run continues from \
                          its last checkpoint";
 /// Time between two checks of the processes.
@@ -52,6 +53,11 @@ const SAMPLE_EVERY: Duration = Duration::from_millis(500);
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     if args.list_settings {
         return settings_page::print(args.json);
+    }
+    if args.live.live.is_some() && args.recording.record == RecordedName::None {
+        return Err(Failed::usage(
+            "--live shows recorded episodes: choose --record evaluation or --record all",
+        ));
     }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
@@ -84,7 +90,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         ));
     }
     if last.end_reason == INTERRUPTED {
-        summary::print_interrupted(&plan);
+        summary::print_interrupted(&plan, args);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     if former_round == Some(last.round) {
@@ -136,13 +142,13 @@ async fn run(
         display.print(NOT_SAVED);
     }
     let last = last.map_err(|RunFailure { exit, error }| {
-        Failed::new(exit, error.context(failure_context(plan, exit)))
+        Failed::new(exit, error.context(failure_context((plan, args), exit)))
     })?;
     if interrupted.is_cancelled()
         && let Saved::Failed(why) = saved
     {
         let exit = Exit::TryAgain;
-        return Err(Failed::new(exit, anyhow!(why)).context(failure_context(plan, exit)));
+        return Err(Failed::new(exit, anyhow!(why)).context(failure_context((plan, args), exit)));
     }
     if last.ended && !interrupted.is_cancelled() {
         return Ok((last, processes.peak_memory()));
@@ -182,14 +188,13 @@ async fn start(
 }
 
 /// Describes how to resume the run, if that can help, and which log to read.
-fn failure_context(plan: &Plan, exit: Exit) -> String {
-    let (log, out) = (plan.log_path(), shell_word(&plan.out));
+fn failure_context((plan, args): (&Plan, &TrainArgs), exit: Exit) -> String {
+    let log = plan.log_path();
     let log = log.display();
     match exit {
         Exit::TryAgain => {
-            format!(
-                "the run was interrupted, resume it with `tandem train --resume --out {out}`; see {log}"
-            )
+            let command = resume_command(&plan.out, args);
+            format!("the run was interrupted, resume it with `{command}`; see {log}")
         }
         _ => format!("the run cannot continue; see {log}"),
     }

@@ -78,6 +78,11 @@ impl RunStatus {
         (self.state, self.failure) = (State::Finished(summary), None);
     }
 
+    /// Notes why a run was not trained, for this start of the sweep.
+    pub(super) fn skip(&mut self, why: String) {
+        self.failure = Some(why);
+    }
+
     /// Marks a run as failed, and stores the reason, which the next start reports.
     pub(super) fn fail(&mut self, why: String) -> anyhow::Result<()> {
         let path = failure_path(&self.dir);
