@@ -104,6 +104,14 @@ pub(crate) fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Fail
     Ok(())
 }
 
+/// Rejects outputs that name the file of an input: writing one would destroy it.
+pub(crate) fn check_keeps(
+    outputs: &[(&str, Option<&Path>)],
+    (name, input): (&str, &Path),
+) -> Result<(), Failed> {
+    outputs.iter().try_for_each(|output| check_distinct(&[(name, Some(input)), *output]))
+}
+
 /// Returns the path without links and `..`, as far as it exists.
 fn resolved(path: &Path) -> PathBuf {
     let in_directory = || {

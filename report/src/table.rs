@@ -3,7 +3,7 @@
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::group::Spread;
+use crate::spread::Spread;
 
 /// Shown for a value that does not exist.
 pub(crate) const NONE: &str = "–";
@@ -191,7 +191,12 @@ pub(crate) fn number(value: f64) -> String {
 
 /// Formats the 95 % interval of an evaluation's success in per cent.
 pub(crate) fn interval(row: &MetricsRow) -> String {
-    format!("{:.1}–{:.1} %", 100.0 * row.success_low, 100.0 * row.success_high)
+    percent_range(Wilson { low: row.success_low, high: row.success_high })
+}
+
+/// Formats an interval in per cent.
+pub(crate) fn percent_range(Wilson { low, high }: Wilson) -> String {
+    format!("{:.1}–{:.1} %", 100.0 * low, 100.0 * high)
 }
 
 /// Formats a count with thousands separators.

@@ -298,7 +298,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
             n_arms: 2,
             n_episodes: 240,
             success: 0.75,
-            interval: (0.69, 0.8),
+            interval: tandem_core::Wilson { low: 0.69, high: 0.8 },
             success_joint: 0.7,
             collision_rate: None,
             contacts: ContactMetrics::default(),

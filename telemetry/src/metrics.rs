@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
-use tandem_core::EvaluationSummary;
+use tandem_core::{EvaluationSummary, Wilson};
 use tandem_system::regular_file;
 
 use crate::error::Error;
@@ -69,7 +69,8 @@ pub struct MetricsRow {
     pub n_episodes: u64,
     /// `true` for the best policy so far.
     pub best: bool,
-    /// Measures with contacts told apart. A file of an earlier version does not have them.
+    /// Measures that distinguish contacts between arms from contacts with the table. A file of an earlier version does not
+    /// have them.
     #[serde(flatten)]
     pub contacts: ContactMetrics,
     /// Training steps so far on which the teacher was asked. A file of an earlier version does not have them.
@@ -77,7 +78,8 @@ pub struct MetricsRow {
     pub advice_queries: Option<u64>,
 }
 
-/// Measures of an evaluation that tell contacts apart. A value that is not known is left out of the file.
+/// Measures of an evaluation that distinguish contacts between arms from contacts with the table. A value that is not
+/// known is left out of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ContactMetrics {
     /// Share of evaluation episodes that end with every object at its goal and have no contact between the arms.
@@ -116,11 +118,11 @@ impl ContactMetrics {
         }
     }
 
-    /// Returns success without contact with the bounds of its 95 % interval, if it is known.
+    /// Returns success without contact with its 95 % interval, if they are known.
     #[must_use]
-    pub fn success(&self) -> Option<[f64; 3]> {
-        let low = self.success_without_contact_low?;
-        Some([self.success_without_contact?, low, self.success_without_contact_high?])
+    pub fn success(&self) -> Option<(f64, Wilson)> {
+        let (low, high) = (self.success_without_contact_low?, self.success_without_contact_high?);
+        Some((self.success_without_contact?, Wilson { low, high }))
     }
 }
 

@@ -74,10 +74,12 @@ mod tests {
         let run = |name: &&str| Run {
             name: (*name).to_owned(),
             rows: vec![MetricsRow { env_steps: 100, n_episodes: 8, ..MetricsRow::default() }],
-            configuration: Some(format!(
+            configuration: format!(
                 "task = {task:?}\narms = {n_arms}\nlabel = {:?}\n[advice]\nstrategy = \"ea\"",
                 name.split("-seed").next().unwrap_or_default()
-            )),
+            )
+            .parse()
+            .ok(),
             ..Run::default()
         };
         let comparison = Comparison::of(names.iter().map(run).collect(), Vec::new());
