@@ -6,7 +6,7 @@ use crate::group::{MILESTONES, SeedGroup, TaskSetup, group_by_settings};
 use crate::measures::CostOf;
 use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::table::{NONE, Table, share_spread, short_number, spread, wrapped};
+use crate::table::{NONE, Table, paragraph, share_spread, short_number, spread};
 use crate::test_evaluation::TestEvaluation;
 
 mod contents;
@@ -108,8 +108,8 @@ impl Comparison {
     pub fn notes(&self) -> String {
         let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, \
              ranges and all intervals.";
-        let legend = if self.is_in_paper() { wrapped(LEGEND) } else { String::new() };
-        format!("{}{legend}", wrapped(notes)).trim_end().to_owned()
+        let legend = if self.is_in_paper() { paragraph(LEGEND) } else { String::new() };
+        format!("{}{legend}", paragraph(notes)).trim_end().to_owned()
     }
 
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
@@ -118,7 +118,7 @@ impl Comparison {
         let sections = self.sections.iter().map(|section| {
             let tables = section.summaries();
             let texts: Vec<String> = tables.iter().map(Table::text).collect();
-            let hint = section.hint().map(|hint| format!("\n{}", wrapped(&hint)));
+            let hint = section.hint().map(|hint| format!("\n{}", paragraph(&hint)));
             format!("{}{}", texts.join("\n"), hint.unwrap_or_default())
         });
         sections.collect::<Vec<_>>().join("\n")

@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 use tandem_core::Episode;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
+use tandem_report::table::thousands;
 use tandem_report::{FilmStrip, run_summary};
 use tandem_system::atomic_file;
 use tandem_telemetry::LogName;
@@ -18,7 +19,7 @@ use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::progress_text::{advice_text, clock_text, failures_text, grouped};
+use crate::progress_text::{advice_text, clock_text, failures_text};
 use crate::run_pages::RunPages;
 use crate::shell::shell_word;
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
@@ -132,10 +133,10 @@ fn summary_lines(
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.push(format!(
         "training      {} env steps, {} update{}, {} round{} in {}",
-        grouped(last.env_steps),
-        grouped(last.updates),
+        thousands(last.env_steps),
+        thousands(last.updates),
         if last.updates == 1 { "" } else { "s" },
-        grouped(last.round),
+        thousands(last.round),
         if last.round == 1 { "" } else { "s" },
         clock_text(last.wall_s)
     ));

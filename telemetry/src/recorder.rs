@@ -129,7 +129,7 @@ impl EpisodeRecorder {
         self.check_lengths(transition)?;
         let scene = scene.into();
         self.set_time(scene, transition.step)?;
-        self.goal = transition.goal.to_vec();
+        transition.goal.clone_into(&mut self.goal);
         self.update_stats(scene, transition);
         self.successes.count(&self.layout, transition.observation, &self.goal);
         let caption = self.step_caption(transition);
