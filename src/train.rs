@@ -111,9 +111,9 @@ async fn run(
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
     let mut display = Display::new(args.quiet);
     announce(plan, &display);
-    let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
+    let mut processes = RunProcesses::new((plan, lock)).or_cannot_write(String::new)?;
     let started = tokio::select! {
-        started = start(plan, &mut processes, &display) => started,
+        started = start(&mut processes, &display) => started,
         () = interrupted.cancelled() => Ok(()),
     };
     let last = match started {
@@ -124,7 +124,7 @@ async fn run(
             {
                 display.print(&failed.line());
             }
-            let mut supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
+            let mut supervisor = Supervisor::new(plan, &mut processes, &mut display);
             supervisor.prints_json = args.progress_json;
             supervisor.run(interrupted).await
         }
@@ -176,12 +176,8 @@ fn announce(plan: &Plan, display: &Display) {
 }
 
 /// Starts all processes in time.
-async fn start(
-    plan: &Plan,
-    processes: &mut RunProcesses,
-    display: &Display,
-) -> Result<(), RunFailure> {
-    let started = tokio::time::timeout(START_TIMEOUT, processes.start(plan, display)).await;
+async fn start(processes: &mut RunProcesses<'_>, display: &Display) -> Result<(), RunFailure> {
+    let started = tokio::time::timeout(START_TIMEOUT, processes.start(display)).await;
     started.unwrap_or_else(|_elapsed| {
         Err(anyhow!("a process did not print its address within {START_TIMEOUT:?}").into())
     })
@@ -201,10 +197,9 @@ fn failure_context((plan, args): (&Plan, &TrainArgs), exit: Exit) -> String {
 }
 
 /// Supervises a run: displays its progress and restarts its processes.
-struct Supervisor<'a> {
+struct Supervisor<'a, 'run> {
     plan: &'a Plan,
-    lock: &'a RunLock,
-    processes: &'a mut RunProcesses,
+    processes: &'a mut RunProcesses<'run>,
     display: &'a mut Display,
     last: pb::Progress,
     /// The stream that delivered the latest message.
@@ -214,19 +209,18 @@ struct Supervisor<'a> {
     started_at: Instant,
     /// Seconds that the run had taken before this start, once a message has reported them.
     earlier_wall_s: Option<f64>,
-    /// Whether every message is printed as JSON.
+    /// True if every message is printed as JSON.
     prints_json: bool,
 }
 
-impl<'a> Supervisor<'a> {
+impl<'a, 'run> Supervisor<'a, 'run> {
     fn new(
-        (plan, lock): (&'a Plan, &'a RunLock),
-        processes: &'a mut RunProcesses,
+        plan: &'a Plan,
+        processes: &'a mut RunProcesses<'run>,
         display: &'a mut Display,
     ) -> Self {
         Self {
             plan,
-            lock,
             processes,
             display,
             last: pb::Progress::default(),
@@ -309,9 +303,9 @@ impl<'a> Supervisor<'a> {
         drop(output::print(message));
     }
 
-    /// Restarts processes that have ended. Returns whether the learner was interrupted.
+    /// Restarts processes that have ended. Returns true if the learner was interrupted.
     fn check_processes(&mut self) -> Result<bool, RunFailure> {
-        let events = self.processes.check(self.plan, self.lock)?;
+        let events = self.processes.check()?;
         events.lines.iter().for_each(|line| self.display.print(line));
         self.awaits_learner |= events.learner_restarted;
         Ok(events.interrupted)
