@@ -1,4 +1,4 @@
-//! Where log lines go, and which of them.
+//! Destinations and filters of log lines.
 
 use tandem_telemetry::logging::{ExtraLayer, LevelFilter, LogConfig};
 

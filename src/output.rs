@@ -44,7 +44,7 @@ fn checked(written: io::Result<()>) -> Result<(), Failed> {
     })
 }
 
-/// Returns whether both standard output and standard error are terminals.
+/// Returns true if both standard output and standard error are terminals.
 pub(crate) fn is_terminal() -> bool {
     io::stdout().is_terminal() && io::stderr().is_terminal()
 }

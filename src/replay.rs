@@ -256,18 +256,18 @@ impl Replayed {
         }
     }
 
-    /// Returns whether only environments that were not given can simulate the log.
+    /// Returns true if only environments that were not given can simulate the log.
     const fn is_not_simulated(&self) -> bool {
         matches!(self.outcome, Err(RecordError::NoSimulator { .. }))
     }
 
-    /// Returns whether the file is the log of a trial or of a bridge's motion instead of an episode.
+    /// Returns true if the file is the log of a trial or of a bridge's motion instead of an episode.
     const fn is_trial(&self) -> bool {
         use tandem_telemetry::Error as E;
         matches!(self.outcome, Err(RecordError::Log(E::TrialLog { .. } | E::MotionLog { .. })))
     }
 
-    /// Returns whether the simulation differs from the log.
+    /// Returns true if the simulation differs from the log.
     const fn differs(&self) -> bool {
         matches!(self.outcome, Err(RecordError::Differs { .. }))
     }

@@ -24,7 +24,7 @@ use crate::{access, call_failure, output, run_directory, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// What to do if a run has no learner at the moment.
+/// The advice if a run has no learner at the moment.
 const STARTING_OR_ENDING: &str = "its run is starting or ending: try again";
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
@@ -62,7 +62,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
 struct Learner {
     client: LearnerClient<AuthChannel>,
     address: String,
-    /// What to do if nothing listens at the address.
+    /// The advice if nothing listens at the address.
     advice: &'static str,
 }
 

@@ -152,7 +152,7 @@ fn refuse(refused: &[String], out: &Path) -> Result<(), Failed> {
     )))
 }
 
-/// How a sweep ended.
+/// The end of a sweep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SweepEnd {
     /// Every run has ended.
@@ -174,9 +174,9 @@ struct Sweep<'a> {
     display: Display,
     /// Lines of runs for the user, at most one of each.
     lines: (mpsc::Sender<String>, mpsc::Receiver<String>),
-    /// What the dashboard shows, if there is one.
+    /// The content of the dashboard, if there is one.
     board: Option<Board>,
-    /// Whether each run serves a dashboard of its own, to which that of the sweep links.
+    /// True if each run serves a dashboard of its own, to which that of the sweep links.
     runs_have_dashboards: bool,
 }
 

@@ -151,13 +151,13 @@ impl SeedGroup {
         Self { label, setup, strategy, runs: vec![run] }
     }
 
-    /// Returns whether the strategy alone identifies these runs.
+    /// Returns true if the strategy alone identifies these runs.
     #[must_use]
     pub fn is_plain_strategy(&self) -> bool {
         self.strategy.as_ref() == Some(&self.label)
     }
 
-    /// Returns whether these runs got no advice.
+    /// Returns true if these runs got no advice.
     #[must_use]
     pub fn is_from_scratch(&self) -> bool {
         self.strategy.as_deref() == Some("none")
@@ -234,7 +234,7 @@ impl SeedGroup {
         self.spread(|run| first_reaching(&run.rows, measure, success).and_then(&value))
     }
 
-    /// Returns whether the evaluations of all runs that have any contain the success without contact.
+    /// Returns true if the evaluations of all runs that have any contain the success without contact.
     pub(crate) fn has_success_without_contact(&self) -> bool {
         let is_known = |row: &MetricsRow| Quantity::SuccessWithoutContact.of(row).is_finite();
         let evaluated = |run: &&Run| !run.rows.is_empty();

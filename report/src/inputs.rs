@@ -164,7 +164,7 @@ impl FoundPaths {
     }
 }
 
-/// Returns whether a single file contains trials, judging by its name or else by its first line.
+/// Returns true if a single file contains trials, judging by its name or else by its first line.
 fn is_trials_file(path: &Path) -> Result<bool, Error> {
     if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
         return Ok(true);

@@ -154,7 +154,7 @@ fn file_stem(slug: &str) -> String {
     slug.to_lowercase().replace(' ', "-")
 }
 
-/// Returns whether `stem` is the name of a plot's file without its extension, of this comparison or of another.
+/// Returns true if `stem` is the name of a plot's file without its extension, of this comparison or of another.
 pub(crate) fn is_file_stem(stem: &str) -> bool {
     let is_panel = |slug: &str| {
         let n_others = slug.strip_prefix("others-").map(str::parse::<usize>);

@@ -41,7 +41,7 @@ impl Quantity {
         }
     }
 
-    /// Returns whether the values are shares, in [0, 1].
+    /// Returns true if the values are shares, in [0, 1].
     #[must_use]
     pub const fn is_share(self) -> bool {
         !matches!(self, Self::MeanQ | Self::AdviceSpent)

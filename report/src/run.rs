@@ -81,7 +81,7 @@ impl Run {
         Ok(run)
     }
 
-    /// Returns whether the run has taken advice.
+    /// Returns true if the run has taken advice.
     pub(crate) fn took_advice(&self) -> bool {
         self.rows.iter().any(|row| row.advice_spent > 0)
     }
@@ -130,7 +130,7 @@ impl Run {
         settings
     }
 
-    /// Returns how far the run is, from its configuration and its last evaluation.
+    /// Returns the length of the run, from its configuration and its last evaluation.
     fn length(&self) -> RunLength {
         let max_env_steps = || {
             let max_env_steps = self.setting("stop")?.get("max_env_steps")?.as_integer()?;
@@ -163,7 +163,7 @@ impl Run {
         TaskSpec::new(Layout::new(task, n_arms).description()).ok()
     }
 
-    /// Returns whether the task reports contacts; true if the task is unknown.
+    /// Returns true if the task reports contacts or is unknown.
     #[must_use]
     pub fn reports_contacts(&self) -> bool {
         self.task_spec().is_none_or(|task| task.reports_contacts())

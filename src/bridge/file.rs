@@ -22,7 +22,7 @@ struct MotionFile {
     speed: Option<f64>,
     /// Positions of the tools; each waypoint has one entry per arm.
     way_points: Option<Vec<Vec<FileWaypoint>>>,
-    /// Whether the path begins at the current positions of the tools; only with waypoints. The default is true.
+    /// True if the path begins at the current positions of the tools; only with waypoints. The default is true.
     from_here: Option<bool>,
     /// Minimum time per waypoint, seconds; only with waypoints. The default is 0.04.
     step_s: Option<f64>,

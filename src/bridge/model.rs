@@ -62,11 +62,11 @@ struct Model {
     listener: TcpListener,
     side: ArmSide,
     peer: Option<Peer>,
-    /// Whether the drives have ever obeyed a bridge.
+    /// True if the drives have ever obeyed a bridge.
     has_obeyed: bool,
-    /// Whether the drives have braked by themselves.
+    /// True if the drives have braked by themselves.
     is_tripped: bool,
-    /// Whether that the arms are at rest after it was told.
+    /// True if a line has reported that the arms are at rest since.
     is_told: bool,
 }
 
@@ -76,7 +76,7 @@ struct Peer {
     address: SocketAddr,
     received: Vec<u8>,
     sender: VectorSender,
-    /// Whether a command has arrived.
+    /// True if a command has arrived.
     has_command: bool,
     /// Samples since the last command.
     n_idle: u32,
@@ -88,7 +88,7 @@ impl Model {
         let clock = clock::BridgeClock::new();
         let mut at_s = clock.now_s();
         while !interrupted.is_cancelled() {
-            // After a pause of the whole machine, time goes on from there.
+            // After a pause of the whole machine, simulated time continues from there.
             at_s = (at_s + PERIOD_S).max(clock.now_s() - 10.0 * PERIOD_S);
             clock.sleep_until(at_s);
             self.accept()?;

@@ -25,7 +25,7 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_millis(40);
 const REPORT_TIMEOUT: Duration = Duration::from_secs(5);
 /// Seconds between two plain lines.
 const PLAIN_EVERY_S: f64 = 1.0;
-/// What helps when the arms are not where a motion starts, for example after a joint has drifted.
+/// The advice if the arms are not where a motion starts, for example after a joint has drifted.
 const START_HINT: &str = " (without a bridge, `tandem bridge to-start` moves real arms to a start posture; simulated \
     arms are there after a restart of their bridge)";
 

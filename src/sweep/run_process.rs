@@ -40,7 +40,7 @@ pub(super) struct RunProcess {
     args: Vec<OsString>,
 }
 
-/// How a run ended.
+/// The end of a run.
 #[derive(Debug, PartialEq)]
 pub(super) enum RunOutcome {
     /// The run is complete, with this summary on the last line of its output.
@@ -220,7 +220,7 @@ async fn follow(output: ChildStdout, progress: &watch::Sender<Value>) -> String 
     last
 }
 
-/// Returns whether a line of output is the summary of a run, and not a message about its progress.
+/// Returns true if a line of output is the summary of a run, and not a message about its progress.
 fn is_summary(object: &Value) -> bool {
     object.get("digest").is_some() && object.get("phase").is_none()
 }

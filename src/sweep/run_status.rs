@@ -26,7 +26,7 @@ pub(super) struct RunStatus {
     /// The run directory.
     pub(super) dir: PathBuf,
     pub(super) state: State,
-    /// Why the latest attempt failed.
+    /// The reason why the latest attempt failed.
     pub(super) failure: Option<String>,
     /// The environment steps to which a run that had fewer is extended.
     pub(super) extends_to: Option<u64>,
@@ -214,7 +214,7 @@ fn server_of(copy: &Path) -> Option<String> {
     Some(table.get("address")?.as_str()?.to_owned())
 }
 
-/// Returns whether the run has a copy of its teacher, if it needs one that the sweep file names.
+/// Returns true if the run has a copy of its teacher, if it needs one that the sweep file names.
 pub(super) fn has_teacher_copy(run: &PlannedRun, dir: &Path) -> bool {
     run.teacher.as_ref().is_none_or(|teacher| teacher_copy(teacher, dir).exists())
 }

@@ -118,7 +118,7 @@ fn is_incomplete(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "part")
 }
 
-/// Returns whether a writer holds the lock of an incomplete log.
+/// Returns true if a writer holds the lock of an incomplete log.
 fn is_being_written(path: &Path) -> bool {
     is_incomplete(path)
         && File::open(path)

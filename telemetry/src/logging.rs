@@ -17,7 +17,7 @@ use crate::standard_error::EventWriter;
 pub struct LogConfig {
     /// Least severe level that is written to standard error; `None` writes nothing there.
     pub console: Option<LevelFilter>,
-    /// Whether lines on standard error are coloured if that is a terminal.
+    /// True if lines on standard error are coloured if that is a terminal.
     pub is_coloured: bool,
     /// Directives that replace the level: `LEVEL` or `TARGET=LEVEL`, separated by commas.
     pub directives: Option<String>,
@@ -55,7 +55,7 @@ fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     }
 }
 
-/// Returns whether `name` can be a module path.
+/// Returns true if `name` can be a module path.
 fn is_target(name: &str) -> bool {
     name.chars().all(|character| character.is_ascii_alphanumeric() || "_-:".contains(character))
 }

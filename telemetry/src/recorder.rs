@@ -81,7 +81,7 @@ pub struct EpisodeRecorder {
     stats: pb::Stats,
     successes: Successes,
     time_ns: u64,
-    /// Whether the log is flushed while it is written.
+    /// True if the log is flushed while it is written.
     is_flushed: bool,
 }
 

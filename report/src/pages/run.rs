@@ -54,12 +54,12 @@ pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
     Ok(body)
 }
 
-/// Returns whether the task reports contacts; true if it is unknown.
+/// Returns true if the task reports contacts or is unknown.
 fn reports_contacts(task: Option<&TaskSpec>) -> bool {
     task.is_none_or(TaskSpec::reports_contacts)
 }
 
-/// Returns whether the task has several arms; true if it is unknown.
+/// Returns true if the task has several arms or is unknown.
 fn has_several_arms(task: Option<&TaskSpec>) -> bool {
     task.is_none_or(|task| task.n_arms() > 1)
 }
