@@ -69,7 +69,7 @@ pub(crate) fn read_token(path: &Path) -> Result<Token, Failed> {
     Ok(token)
 }
 
-/// Returns whether the mode of the file lets all users read it.
+/// Returns true if the mode of the file lets all users read it.
 #[cfg(unix)]
 fn is_readable_by_all(path: &Path) -> bool {
     use std::os::unix::fs::PermissionsExt as _;

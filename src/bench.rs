@@ -1,7 +1,10 @@
 //! `tandem bench`: measures the performance of the parts on this machine, as rates and as ratios within one run.
 
 use std::path::Path;
+use std::pin::pin;
+use std::process::{Output, Stdio};
 
+use anyhow::anyhow;
 use clap::ValueEnum as _;
 use serde_json::{Value, json};
 use tandem_bench::{Clock, Figure, rates};
@@ -9,7 +12,7 @@ use tandem_core::Task;
 
 use crate::cli::{BenchArgs, BenchName};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::{clock, output, policy_file, program};
+use crate::{clock, output, policy_file, program, runtime, signals};
 
 mod record;
 mod scale;
@@ -79,21 +82,38 @@ fn end_to_end() -> Result<Vec<Figure>, Failed> {
 }
 
 /// Trains in a temporary directory with these options, and returns the summary and what `inspect` finds in the directory
-/// before it is removed.
+/// before it is removed, also if the run is interrupted.
 fn short_run<T>(options: &[&str], inspect: impl FnOnce(&Path) -> T) -> Result<(Value, T), Failed> {
     let directory = std::env::temp_dir().join(format!("tandem-bench-{}", std::process::id()));
     let program = program::file().or_exit(Exit::Bug, String::new)?;
-    let run = std::process::Command::new(program)
-        .args(["train", "--json", "--max-minutes", "0"])
-        .args(options)
-        .arg("--out")
-        .arg(&directory)
-        .stderr(std::process::Stdio::null())
-        .output();
+    let mut command = tokio::process::Command::new(program);
+    command.args(["train", "--json", "--exit-with-stdin", "--no-dashboard", "--max-minutes", "0"]);
+    command.args(options).arg("--out").arg(&directory);
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let run = output_of(command);
     let inspected = inspect(&directory);
     drop(std::fs::remove_dir_all(&directory));
-    let output = run.or_exit(Exit::TryAgain, || "cannot start a run".to_owned())?;
-    let summary = serde_json::from_slice(&output.stdout)
+    let summary = serde_json::from_slice(&run?.stdout)
         .or_exit(Exit::TryAgain, || "the short run failed; try `tandem train`".to_owned())?;
     Ok((summary, inspected))
+}
+
+/// Runs a command to its end. If a signal comes first, closes its standard input and waits until it has exited.
+fn output_of(mut command: tokio::process::Command) -> Result<Output, Failed> {
+    let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
+    runtime.block_on(async {
+        let interrupted = signals::shutdown_token(false)?;
+        let cannot_start = || "cannot start a run".to_owned();
+        let mut child = command.spawn().or_exit(Exit::TryAgain, cannot_start)?;
+        let input = child.stdin.take();
+        let mut ended = pin!(child.wait_with_output());
+        tokio::select! {
+            output = &mut ended => output.or_exit(Exit::TryAgain, cannot_start),
+            () = interrupted.cancelled() => {
+                drop(input);
+                drop(ended.await);
+                Err(Failed::new(Exit::Interrupted, anyhow!("interrupted")))
+            }
+        }
+    })
 }

@@ -93,6 +93,11 @@ pub(crate) fn url(address: SocketAddr) -> String {
     }
 }
 
+/// Returns the port of an [`url`] at the end of a line.
+pub(crate) fn port_of(line: &str) -> Option<u16> {
+    line.trim_end_matches('/').rsplit_once(':')?.1.parse().ok()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -119,5 +124,14 @@ mod tests {
     fn an_address_of_all_interfaces_is_opened_as_localhost() {
         assert_eq!(url("0.0.0.0:8600".parse().expect("an address")), "http://localhost:8600/");
         assert_eq!(url("[::1]:86".parse().expect("an address")), "http://[::1]:86/");
+    }
+
+    #[test]
+    fn the_port_is_at_the_end_of_the_line_with_the_address() {
+        for address in ["127.0.0.1:8600", "0.0.0.0:8601", "[::1]:86"] {
+            let address: SocketAddr = address.parse().expect("an address");
+            assert_eq!(port_of(&format!("dashboard on {}", url(address))), Some(address.port()));
+        }
+        assert_eq!(port_of("no dashboard: every port is in use"), None);
     }
 }

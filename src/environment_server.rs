@@ -98,7 +98,7 @@ pub(crate) fn shell_words(args: &EnvironmentArgs) -> String {
     words.collect::<Vec<_>>().join(" ")
 }
 
-/// Returns whether the options name a server.
+/// Returns true if the options name a server.
 pub(crate) const fn names_server(args: &EnvironmentArgs) -> bool {
     args.env.is_some() || args.env_command.is_some()
 }

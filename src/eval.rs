@@ -26,6 +26,7 @@ pub(crate) fn eval(args: &EvalArgs) -> Result<(), Failed> {
     let film = PlannedFilm::of(&args.film)?;
     args.live.live.map_or(Ok(()), live::check_address)?;
     args.record.as_deref().map_or(Ok(()), check_record)?;
+    check_distinct_files(args)?;
     if let Some(directory) = &args.record_dir {
         std::fs::create_dir_all(directory)
             .or_cannot_write(|| format!("cannot create {}", directory.display()))?;
@@ -114,6 +115,23 @@ fn check_record(path: &Path) -> Result<(), Failed> {
         true => Err(Failed::usage(format!("cannot write {path:?}: it is not a regular file"))),
         false => output::check_directory_of(path),
     }
+}
+
+/// Rejects outputs that would replace each other or a policy.
+fn check_distinct_files(args: &EvalArgs) -> Result<(), Failed> {
+    let outputs = [("--record", args.record.as_deref()), ("--film", args.film.film.as_deref())];
+    output::check_distinct(&outputs)?;
+    let policies = [
+        ("--policy", &args.policy),
+        ("--composed-teachers", &args.composed_teachers),
+        ("--teacher", &args.teacher),
+    ];
+    for (name, path) in policies {
+        // A policy that is missing is reported when it is read.
+        let file = path.as_deref().and_then(|path| policy_file::file_of(path).ok());
+        file.map_or(Ok(()), |file| output::check_keeps(&outputs, (name, &file)))?;
+    }
+    Ok(())
 }
 
 fn subject(args: &EvalArgs) -> Result<EvaluatedPolicy, Failed> {

@@ -160,7 +160,7 @@ fn moment(world: &Env, task: &TaskSpec, n_succeeding: &mut [usize]) -> FilmStep 
     FilmStep { achieved, scene: world.scene() }
 }
 
-/// Counts a moment in which an arm succeeds or not. Returns whether it has succeeded in the latest `n_required` ones.
+/// Counts a moment in which an arm succeeds or not. Returns true if it has succeeded in the latest `n_required` ones.
 const fn has_held(n_succeeding: &mut usize, succeeds: bool, n_required: usize) -> bool {
     *n_succeeding = if succeeds { *n_succeeding + 1 } else { 0 };
     *n_succeeding >= n_required

@@ -113,10 +113,20 @@ impl ChildProcess {
         Ok(address.strip_prefix("listening on ").map(str::to_owned))
     }
 
-    /// Reads the address of a service, and the line about its dashboard.
-    pub(crate) async fn addresses(&mut self) -> anyhow::Result<Option<(String, String)>> {
-        let [address, dashboard] = self.lines().await?;
-        Ok(address.strip_prefix("listening on ").map(|address| (address.to_owned(), dashboard)))
+    /// Reads the address of a service and, with `has_dashboard`, the line about its dashboard; `None` if the process does
+    /// not print its address.
+    pub(crate) async fn addresses(
+        &mut self,
+        has_dashboard: bool,
+    ) -> anyhow::Result<Option<ServiceAddresses>> {
+        if !has_dashboard {
+            let service = self.service_address().await?;
+            return Ok(service.map(|service| ServiceAddresses { service, dashboard_line: None }));
+        }
+        let [address, line] = self.lines().await?;
+        let dashboard_line = Some(line).filter(|line| !line.is_empty());
+        let service = address.strip_prefix("listening on ").map(str::to_owned);
+        Ok(service.map(|service| ServiceAddresses { service, dashboard_line }))
     }
 
     /// Reads the first lines of standard output; a line that the process does not print is empty.
@@ -141,7 +151,16 @@ impl ChildProcess {
     }
 }
 
-/// How a process ended.
+/// The lines that a service prints when it is ready.
+#[derive(Debug)]
+pub(crate) struct ServiceAddresses {
+    /// The address of the service.
+    pub(crate) service: String,
+    /// The line about its dashboard, which ends with its URL if there is one.
+    pub(crate) dashboard_line: Option<String>,
+}
+
+/// The end of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ProcessEnd {
     /// With this exit code.

@@ -1,4 +1,4 @@
-//! Where log lines go, and which of them.
+//! Destinations and filters of log lines.
 
 use tandem_telemetry::logging::{ExtraLayer, LevelFilter, LogConfig};
 
@@ -22,8 +22,7 @@ pub(crate) fn start(cli: &Cli) -> Result<LogGuard, Failed> {
         _ => LevelFilter::WARN,
     };
     let directives = cli.log.clone().or_else(rust_log);
-    let config =
-        LogConfig { console: Some(level), is_coloured: wants_colour(), file: None, directives };
+    let config = LogConfig { console: Some(level), is_coloured: wants_colour(), directives };
     let (extra, guard) = spans(cli)?;
     tandem_telemetry::logging::init(&config, extra).or_exit(Exit::Usage, String::new)?;
     Ok(guard)

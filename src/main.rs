@@ -37,6 +37,7 @@ mod policy;
 mod policy_file;
 mod program;
 mod progress_json;
+mod progress_lines;
 mod progress_text;
 mod replay;
 mod report;

@@ -87,7 +87,7 @@ fn resource(component: &str) -> Resource {
 struct Collector {
     client: TraceServiceClient<AuthChannel>,
     resource: Resource,
-    /// Whether the log has a warning that the collector does not answer.
+    /// True if the log has a warning that the collector does not answer.
     is_away: bool,
 }
 

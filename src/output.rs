@@ -44,7 +44,7 @@ fn checked(written: io::Result<()>) -> Result<(), Failed> {
     })
 }
 
-/// Returns whether both standard output and standard error are terminals.
+/// Returns true if both standard output and standard error are terminals.
 pub(crate) fn is_terminal() -> bool {
     io::stdout().is_terminal() && io::stderr().is_terminal()
 }
@@ -102,6 +102,14 @@ pub(crate) fn check_distinct(files: &[(&str, Option<&Path>)]) -> Result<(), Fail
         former.push((name, file));
     }
     Ok(())
+}
+
+/// Rejects outputs that name the file of an input: writing one would destroy it.
+pub(crate) fn check_keeps(
+    outputs: &[(&str, Option<&Path>)],
+    (name, input): (&str, &Path),
+) -> Result<(), Failed> {
+    outputs.iter().try_for_each(|output| check_distinct(&[(name, Some(input)), *output]))
 }
 
 /// Returns the path without links and `..`, as far as it exists.

@@ -5,23 +5,24 @@ use std::collections::BTreeMap;
 
 use tandem_core::text::counted;
 use tandem_proto::pb;
+use tandem_report::table::thousands;
 
 /// Workers that are named one by one; more are counted.
 const MAX_NAMED_WORKERS: usize = 4;
 
 /// Returns the environment steps and updates of a run and the remaining time, after the time so far.
 pub(crate) fn counts_line(progress: &pb::Progress) -> String {
-    let steps = grouped(progress.env_steps);
+    let steps = thousands(progress.env_steps);
     let steps = match progress.max_env_steps {
         0 => format!("{steps} env steps"),
-        max => format!("{steps} of {} env steps", grouped(max)),
+        max => format!("{steps} of {} env steps", thousands(max)),
     };
     let left = remaining_s(progress).map(|left_s| format!(", {} left", clock_text(left_s)));
     format!(
         "{} {steps}{}, {} updates{}",
         clock_text(progress.wall_s),
         rate(progress.env_steps_per_s),
-        grouped(progress.updates),
+        thousands(progress.updates),
         left.unwrap_or_default()
     )
 }
@@ -60,7 +61,7 @@ pub(crate) fn evaluation_line(progress: &pb::Progress, evaluation: &pb::Evaluati
     format!(
         "{} {} env steps: success {:.3} [{:.3}, {:.3}]{}",
         clock_text(progress.wall_s),
-        grouped(evaluation.env_steps),
+        thousands(evaluation.env_steps),
         evaluation.success,
         evaluation.success_low,
         evaluation.success_high,
@@ -81,7 +82,7 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
             let without_contact =
                 without_contact.map(|share| format!(" ({share:.3} without contact)"));
             let (without_contact, env_steps) =
-                (without_contact.unwrap_or_default(), grouped(best.env_steps));
+                (without_contact.unwrap_or_default(), thousands(best.env_steps));
             format!("{:.3}{without_contact} at {env_steps} env steps", best.success)
         }
         None => "none yet".to_owned(),
@@ -97,10 +98,11 @@ pub(crate) fn state_lines(progress: &pb::Progress) -> Vec<String> {
 /// Returns the advice that the run has spent and the steps on which it asked; `None` if it asks for none.
 pub(crate) fn advice_text(progress: &pb::Progress) -> Option<String> {
     let (spent, left) = (progress.advice_spent, progress.budget_left);
-    let queries = progress.advice_queries.map(|queries| format!(", {} queries", grouped(queries)));
+    let queries =
+        progress.advice_queries.map(|queries| format!(", {} queries", thousands(queries)));
     let queries = queries.unwrap_or_default();
     (spent > 0 || left > 0)
-        .then(|| format!("{} spent, {} left{queries}", grouped(spent), grouped(left)))
+        .then(|| format!("{} spent, {} left{queries}", thousands(spent), thousands(left)))
 }
 
 /// Returns what each worker does, or how many do it if there are many.
@@ -135,24 +137,12 @@ pub(crate) fn clock_text(seconds: f64) -> String {
     }
 }
 
-/// Formats a number with a comma between groups of three digits.
-pub(crate) fn grouped(number: u64) -> String {
-    let digits = number.to_string();
-    let groups: Vec<&str> = digits
-        .as_bytes()
-        .rchunks(3)
-        .rev()
-        .filter_map(|group| std::str::from_utf8(group).ok())
-        .collect();
-    groups.join(",")
-}
-
 /// Describes the failures of environments on servers, if there were any.
 pub(crate) fn failures_text(progress: &pb::Progress) -> Option<String> {
     match progress.environment_failures {
         0 => None,
         1 => Some("failed once, the log of the worker has the cause".to_owned()),
-        n => Some(format!("failed {} times, the log of the workers has the causes", grouped(n))),
+        n => Some(format!("failed {} times, the log of the workers has the causes", thousands(n))),
     }
 }
 
@@ -266,11 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_grouped_and_times_have_minutes() {
-        assert_eq!(
-            [grouped(0), grouped(999), grouped(1_000), grouped(12_345_678)],
-            ["0", "999", "1,000", "12,345,678"]
-        );
+    fn times_have_minutes() {
         assert_eq!(
             [clock_text(0.0), clock_text(61.9), clock_text(3600.0), clock_text(7325.0)],
             ["00:00", "01:01", "1:00:00", "2:02:05"]

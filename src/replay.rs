@@ -1,6 +1,7 @@
 //! `tandem replay`: simulates recorded episodes again and compares them with their logs.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -199,7 +200,7 @@ fn find_logs(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
             continue;
         }
         let n_before = files.len();
-        collect_logs(path, &mut files)
+        collect_logs(path, &mut files, &mut BTreeSet::new())
             .or_exit(Exit::Data, || format!("cannot read the directory {}", path.display()))?;
         if files.len() == n_before {
             return Err(Failed::new(Exit::Data, anyhow!("no *.mcap below {}", path.display())));
@@ -208,13 +209,22 @@ fn find_logs(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failed> {
     Ok(files)
 }
 
-fn collect_logs(directory: &Path, files: &mut Vec<PathBuf>) -> std::io::Result<()> {
+/// Adds the logs in and below a directory. Links are followed; a directory among `searched`, to which one may lead again,
+/// is left out.
+fn collect_logs(
+    directory: &Path,
+    files: &mut Vec<PathBuf>,
+    searched: &mut BTreeSet<PathBuf>,
+) -> std::io::Result<()> {
+    if !searched.insert(directory.canonicalize()?) {
+        return Ok(());
+    }
     let mut entries = std::fs::read_dir(directory)?.collect::<Result<Vec<_>, _>>()?;
     entries.sort_by_key(std::fs::DirEntry::path);
     for entry in entries {
         let path = entry.path();
-        if entry.file_type()?.is_dir() {
-            collect_logs(&path, files)?;
+        if path.is_dir() {
+            collect_logs(&path, files, searched)?;
         } else if path.extension().is_some_and(|extension| extension == "mcap") {
             files.push(path);
         }
@@ -246,18 +256,18 @@ impl Replayed {
         }
     }
 
-    /// Returns whether only environments that were not given can simulate the log.
+    /// Returns true if only environments that were not given can simulate the log.
     const fn is_not_simulated(&self) -> bool {
         matches!(self.outcome, Err(RecordError::NoSimulator { .. }))
     }
 
-    /// Returns whether the file is the log of a trial or of a bridge's motion instead of an episode.
+    /// Returns true if the file is the log of a trial or of a bridge's motion instead of an episode.
     const fn is_trial(&self) -> bool {
         use tandem_telemetry::Error as E;
         matches!(self.outcome, Err(RecordError::Log(E::TrialLog { .. } | E::MotionLog { .. })))
     }
 
-    /// Returns whether the simulation differs from the log.
+    /// Returns true if the simulation differs from the log.
     const fn differs(&self) -> bool {
         matches!(self.outcome, Err(RecordError::Differs { .. }))
     }
@@ -334,5 +344,28 @@ fn problem_json(log: &Replayed) -> Value {
             "played": played,
         }),
         _ => json!({ "file": shown(log), "problem": log.problem() }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn logs_behind_links_are_found_once() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = |name: &str| directory.path().join(name);
+        for name in ["disk/run", "runs/other"] {
+            std::fs::create_dir_all(path(name)).expect("creates");
+            std::fs::write(path(name).join("eval-000001-000.mcap"), "").expect("writes");
+        }
+        let link = |to: &str, name: &str| std::os::unix::fs::symlink(path(to), path(name));
+        link("disk/run", "runs/linked").expect("links");
+        link("runs", "runs/other/up").expect("links");
+        link("runs/other", "runs/same").expect("links");
+        let logs = find_logs(&[path("runs")]).expect("logs");
+        let expected =
+            ["runs/linked", "runs/other"].map(|run| path(run).join("eval-000001-000.mcap"));
+        assert_eq!(logs, expected);
     }
 }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use tandem_report::{
-    Baseline, Comparison, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, Run, TestEvaluation,
-    Trials, export, report_html, trials,
+    Baseline, Comparison, Configuration, FilmStrip, PlottedTrials, ReportFiles, ReportInputs, Run,
+    TestEvaluation, Trials, export, report_html, trials,
 };
 
 use tandem_core::Task;
@@ -24,20 +24,14 @@ use crate::{film, output, policy_file, run_file};
 const TEST_EPISODES: u64 = 240;
 
 pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
-    for file in [&args.csv, &args.markdown].into_iter().flatten() {
-        output::check_directory_of(file)?;
-    }
     let page = args.out.clone().unwrap_or_else(|| default_page(&args.paths));
-    output::check_is_no_directory(&page)?;
-    output::check_distinct(&[
-        ("--out", Some(page.as_path())),
-        ("--csv", args.csv.as_deref()),
-        ("--markdown", args.markdown.as_deref()),
-    ])?;
+    check_outputs(args, &page)?;
     let mut inputs = ReportInputs::load(&args.paths).or_exit(Exit::Data, String::new)?;
+    check_no_input(&outputs(args, &page), &inputs)?;
     for run in &mut inputs.runs {
         // Runs of one configuration form a group, whichever version wrote their files.
-        let completed = run.configuration.as_deref().and_then(run_file::completed);
+        let text = run.configuration.as_ref().map(Configuration::text);
+        let completed = text.and_then(run_file::completed).and_then(|text| text.parse().ok());
         run.configuration = completed.or(run.configuration.take());
     }
     let trials = Trials::of(inputs.trials);
@@ -46,12 +40,59 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
         let baselines = baselines(args, &inputs.runs)?;
         Comparison::of(inputs.runs, baselines)
     };
+    warn(comparison.warnings.iter());
     comparison.films = films(args)?;
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
-    let files = report_html(&comparison, &trials, plotted, &page).or_cannot_write(String::new)?;
-    write(args.csv.as_deref(), || export::csv(&comparison))?;
-    write(args.markdown.as_deref(), || comparison.markdown())?;
-    print(args, &comparison, &trials, &files)
+    let files = report_html(&comparison, &trials, plotted, &page)
+        .or_cannot_write(|| "the page is not written, choose another --out".to_owned());
+    let written = write(args.csv.as_deref(), || export::csv(&comparison))
+        .and_then(|()| write(args.markdown.as_deref(), || comparison.markdown()));
+    // Also if a file could not be written, as in a directory that cannot be changed.
+    print(args, &comparison, &trials, files.as_ref().ok())?;
+    files?;
+    written
+}
+
+/// Returns the files that the report writes, with the names of their options.
+fn outputs<'a>(args: &'a ReportArgs, page: &'a Path) -> [(&'static str, Option<&'a Path>); 3] {
+    [
+        ("--out", Some(page)),
+        ("--csv", args.csv.as_deref()),
+        ("--markdown", args.markdown.as_deref()),
+    ]
+}
+
+/// Rejects outputs that cannot be written, or that would replace each other or a file that the command line names.
+fn check_outputs(args: &ReportArgs, page: &Path) -> Result<(), Failed> {
+    for file in [&args.csv, &args.markdown].into_iter().flatten() {
+        output::check_directory_of(file)?;
+    }
+    output::check_is_no_directory(page)?;
+    if !page.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html")) {
+        let shown = page.display();
+        return Err(Failed::usage(format!("--out {shown}: the name must end in .html")));
+    }
+    let outputs = outputs(args, page);
+    output::check_distinct(&outputs)?;
+    let evals = args.evals.iter().map(|path| ("--eval", path));
+    let teachers = args.composed_teachers.iter().map(|path| ("--composed-teachers", path));
+    let filmed = args.film_strips.iter().map(|path| ("--film-strips", path));
+    evals
+        .chain(teachers)
+        .chain(filmed)
+        .try_for_each(|(name, input)| output::check_keeps(&outputs, (name, input)))
+}
+
+/// Rejects outputs that would replace a file of a run or of trials.
+fn check_no_input(outputs: &[(&str, Option<&Path>)], inputs: &ReportInputs) -> Result<(), Failed> {
+    let named = outputs.iter().filter_map(|(name, path)| Some((name, (*path)?)));
+    match named.into_iter().find(|(_, path)| inputs.contains(path)) {
+        Some((name, path)) => Err(Failed::usage(format!(
+            "{name} {}: the report reads this file; choose another",
+            path.display()
+        ))),
+        None => Ok(()),
+    }
 }
 
 /// Writes `text` to a file that the command line names.
@@ -66,14 +107,14 @@ fn print(
     args: &ReportArgs,
     comparison: &Comparison,
     trials: &Trials,
-    files: &ReportFiles,
+    files: Option<&ReportFiles>,
 ) -> Result<(), Failed> {
     if args.json {
         let mut value = export::json(comparison);
         value["trials"] = trials::json(trials);
-        value["report"] = json!(files.page.to_string_lossy());
-        let figures = files.plots.iter().map(|path| path.to_string_lossy());
-        value["figures"] = figures.collect();
+        value["report"] = json!(files.map(|files| files.page.to_string_lossy()));
+        let plots = files.iter().flat_map(|files| &files.plots);
+        value["figures"] = plots.map(|path| path.to_string_lossy()).collect();
         return output::print(value);
     }
     if !trials.groups.is_empty() {
@@ -86,6 +127,7 @@ fn print(
         output::print(comparison.text())?;
         output::print(comparison.notes())?;
     }
+    let Some(files) = files else { return Ok(()) };
     output::print(format_args!("report        {}", files.page.display()))?;
     if let Some(directory) = files.plots.first().and_then(|figure| figure.parent()) {
         let n_figures = counted(files.plots.len(), "file");
@@ -109,8 +151,11 @@ fn warn<'a>(warnings: impl Iterator<Item = &'a String>) {
 fn baselines(args: &ReportArgs, runs: &[Run]) -> Result<Vec<Baseline>, Failed> {
     let mut baselines = Vec::new();
     for path in &args.evals {
-        let test = TestEvaluation::load(path).or_exit(Exit::Data, String::new)?;
+        let (test, more) = TestEvaluation::load(path).or_exit(Exit::Data, String::new)?;
         baselines.push(Baseline { label: stem(path), test });
+        let label = |name| format!("{}, {name}", stem(path));
+        baselines
+            .extend(more.into_iter().map(|(name, test)| Baseline { label: label(name), test }));
     }
     for path in &args.composed_teachers {
         let teacher = policy_file::load(path)?;
@@ -142,7 +187,7 @@ fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> Test
         n_arms: layout.n_arms,
         n_episodes: summary.n_episodes as u64,
         success: summary.success,
-        interval: (summary.interval.low, summary.interval.high),
+        interval: summary.interval,
         success_joint: summary.success_joint,
         collision_rate: Some(summary.collision_rate),
         contacts: ContactMetrics::of(summary),

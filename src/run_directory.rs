@@ -44,7 +44,7 @@ pub(crate) fn saved_round(out: &Path) -> Option<u64> {
     tandem_learner::checkpoint::round_of(checkpoints.last()?)
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum RunState {
     /// Nothing is saved yet.
@@ -74,7 +74,7 @@ pub(crate) fn summary(out: &Path) -> Option<Value> {
     serde_json::from_slice(&bytes).ok().filter(Value::is_object)
 }
 
-/// Returns how far the run in `out` with this configuration is, if that is valid.
+/// Returns the length of the run in `out` with this configuration, if that is valid.
 pub(crate) fn length(out: &Path, run: Option<&RunConfig>) -> RunLength {
     let saved = saved_round(out).zip(run);
     RunLength {
@@ -83,7 +83,7 @@ pub(crate) fn length(out: &Path, run: Option<&RunConfig>) -> RunLength {
     }
 }
 
-/// Returns how far the run in `out` is.
+/// Returns the progress of the run in `out`.
 pub(crate) fn state(out: &Path) -> RunState {
     let config = run_file::resolve(Some(&out.join("run.toml")), &[]).ok();
     let length = length(out, config.as_ref());

@@ -8,12 +8,8 @@ use tandem_proto::pb;
 
 use crate::columns::{fitting, terminal_columns, wrapped};
 use crate::output;
-use crate::progress_text::{
-    counts_line, evaluation_line, fraction_done, state_lines, warning_line,
-};
-
-/// Seconds of run time after which a plain line is printed even without news.
-const PLAIN_EVERY_S: f64 = 30.0;
+use crate::progress_lines::{ProgressLine, ProgressLines};
+use crate::progress_text::{counts_line, fraction_done, state_lines};
 
 /// Live lines below the bar.
 const N_LINES: usize = 4;
@@ -22,11 +18,7 @@ const INDENT: &str = "  ";
 pub(crate) struct Display {
     live: Option<Live>,
     is_quiet: bool,
-    /// Run time of the latest plain line.
-    printed_at_s: f64,
-    /// Round of the latest evaluation that was printed.
-    printed_evaluation: Option<u64>,
-    printed_warning: String,
+    lines: ProgressLines,
 }
 
 struct Live {
@@ -40,40 +32,30 @@ impl Display {
         Self {
             live: (!is_quiet && std::io::stderr().is_terminal()).then(Live::new),
             is_quiet,
-            printed_at_s: -PLAIN_EVERY_S,
-            printed_evaluation: None,
-            printed_warning: String::new(),
+            lines: ProgressLines::default(),
         }
+    }
+
+    /// Notes that the following messages may be those of a restarted learner.
+    pub(crate) fn begin_stream(&mut self) {
+        self.lines.begin_stream();
     }
 
     pub(crate) fn show(&mut self, progress: &pb::Progress) {
         if progress.task.is_empty() {
             return;
         }
-        if progress.warning != self.printed_warning {
-            self.printed_warning.clone_from(&progress.warning);
-            match self.is_quiet {
-                true => output::message(warning_line(progress)),
-                false => {
-                    let line = warning_line(progress);
-                    // A line of a file stays whole, so that programs find it.
-                    let is_wrapped = self.live.is_some();
-                    self.print(&if is_wrapped { wrapped(&line, "      ") } else { line });
+        for line in self.lines.of(progress) {
+            match line {
+                ProgressLine::Warning(line) if self.is_quiet => output::message(line),
+                ProgressLine::Warning(line) if self.live.is_some() => {
+                    self.print(&wrapped(&line, "      "));
                 }
+                // The live lines have the counts.
+                ProgressLine::Counts(_) if self.live.is_some() => {}
+                // A line of a file stays whole, so that programs find it.
+                line => self.print(line.text()),
             }
-        }
-        if self.is_quiet {
-            return;
-        }
-        if let Some(evaluation) = &progress.evaluation
-            && self.printed_evaluation != Some(evaluation.round)
-        {
-            self.printed_evaluation = Some(evaluation.round);
-            self.printed_at_s = progress.wall_s;
-            self.print(&evaluation_line(progress, evaluation));
-        } else if self.live.is_none() && progress.wall_s - self.printed_at_s >= PLAIN_EVERY_S {
-            self.printed_at_s = progress.wall_s;
-            self.print(&counts_line(progress));
         }
         if let Some(live) = &self.live {
             live.show(progress);
@@ -138,7 +120,8 @@ pub(crate) fn bar(what: &str) -> ProgressBar {
     bar
 }
 
-fn style(template: &str) -> ProgressStyle {
+/// Returns the style of a bar or a live line.
+pub(crate) fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template)
         .unwrap_or_else(|_| ProgressStyle::default_bar())
         .progress_chars("=> ")

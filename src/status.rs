@@ -1,6 +1,7 @@
 //! `tandem status`: shows the progress of a run, from any machine that can reach its learner, or from its directory.
 
 mod recorded;
+mod watch;
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,15 +20,12 @@ use crate::progress_json::progress_json;
 use crate::progress_text::{
     counts_line, evaluation_line, failures_text, state_lines, warning_line,
 };
-use crate::run_display::Display;
 use crate::{access, call_failure, output, run_directory, runtime};
 
 /// Timeout of a call.
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// What to do if a run has no learner at the moment.
+/// The advice if a run has no learner at the moment.
 const STARTING_OR_ENDING: &str = "its run is starting or ending: try again";
-/// Seconds of run time after which a line is printed even without news.
-const LINE_EVERY_S: f64 = 30.0;
 
 pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     let client_config = access::client_config(&args.client_config, &args.secret)?;
@@ -52,7 +50,11 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
             },
             address,
         };
-        if args.watch { watch(&mut learner, args).await } else { show(&mut learner, args).await }
+        if args.watch {
+            watch::watch(&mut learner, args).await
+        } else {
+            show(&mut learner, args).await
+        }
     })
 }
 
@@ -60,11 +62,11 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
 struct Learner {
     client: LearnerClient<AuthChannel>,
     address: String,
-    /// What to do if nothing listens at the address.
+    /// The advice if nothing listens at the address.
     advice: &'static str,
 }
 
-/// Where the progress comes from.
+/// The source of a progress report.
 enum Source {
     /// The learner at this address.
     Learner(String),
@@ -108,77 +110,6 @@ async fn show(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
         lines(&progress).iter().try_for_each(output::print)?;
     }
     Ok(())
-}
-
-/// Shows the progress until the run has ended: live on a terminal, elsewhere as [`PlainLines`] or each message as JSON.
-async fn watch(learner: &mut Learner, args: &StatusArgs) -> Result<(), Failed> {
-    let call = learner.client.watch(pb::WatchRequest {});
-    let mut stream = call_with_timeout(call, learner.advice).await?;
-    let mut plain = PlainLines::default();
-    let is_live = !args.json && output::is_terminal();
-    let mut display = is_live.then(|| Display::new(false));
-    loop {
-        let progress = match stream.message().await {
-            Ok(Some(progress)) => progress,
-            Err(status) if !is_lost(&status) => return Err(failed(&status, learner.advice)),
-            Ok(None) | Err(_) => {
-                let address = &learner.address;
-                let lost = anyhow!("the learner at {address} is gone before the end of the run");
-                return Err(Failed::new(Exit::TryAgain, lost));
-            }
-        };
-        if args.json {
-            output::print(progress_json(&progress))?;
-        } else if let Some(display) = &mut display {
-            display.show(&progress);
-        } else {
-            plain.of(&progress).iter().try_for_each(output::print)?;
-        }
-        if progress.ended {
-            display.iter_mut().for_each(Display::close);
-            if !args.json {
-                output::print(format_args!("ended: {}", progress.end_reason))?;
-            }
-            return Ok(());
-        }
-    }
-}
-
-/// The progress without a terminal: a line for each evaluation, for each warning and its end, and every half minute.
-#[derive(Default)]
-struct PlainLines {
-    /// Round of the latest evaluation.
-    round: Option<u64>,
-    /// Run time of the latest evaluation or counts, seconds.
-    at_s: Option<f64>,
-    warning: String,
-}
-
-impl PlainLines {
-    /// Returns the lines about `progress` that are new.
-    fn of(&mut self, progress: &pb::Progress) -> Vec<String> {
-        let mut lines = Vec::new();
-        if progress.warning != self.warning {
-            self.warning.clone_from(&progress.warning);
-            lines.push(warning_line(progress));
-        }
-        let is_due = self.at_s.is_none_or(|at_s| progress.wall_s - at_s >= LINE_EVERY_S);
-        if let Some(evaluation) = progress.evaluation.as_ref()
-            && self.round != Some(evaluation.round)
-        {
-            (self.round, self.at_s) = (Some(evaluation.round), Some(progress.wall_s));
-            lines.push(evaluation_line(progress, evaluation));
-        } else if is_due {
-            self.at_s = Some(progress.wall_s);
-            lines.push(counts_line(progress));
-        }
-        lines
-    }
-}
-
-/// Returns whether an open stream ended because its connection did.
-fn is_lost(status: &Status) -> bool {
-    matches!(status.code(), Code::Unknown | Code::Unavailable | Code::Cancelled | Code::Internal)
 }
 
 /// Runs a call with a timeout.
@@ -250,28 +181,5 @@ mod tests {
         );
         let ended = pb::Progress { ended: true, end_reason: "done".to_owned(), ..progress };
         assert_eq!(lines(&ended).last().map(String::as_str), Some("ended: done"));
-    }
-
-    #[test]
-    fn without_a_terminal_warnings_and_their_ends_are_lines_too() {
-        let mut plain = PlainLines::default();
-        let mut check = |wall_s: f64, warning: &str, round: Option<u64>, expected: &[&str]| {
-            let evaluation =
-                round.map(|round| pb::Evaluation { round, success: 0.5, ..Default::default() });
-            let warning = warning.to_owned();
-            let progress = pb::Progress { wall_s, warning, evaluation, ..Default::default() };
-            let lines = plain.of(&progress);
-            assert_eq!(lines.len(), expected.len(), "{lines:?}");
-            for (line, word) in lines.iter().zip(expected) {
-                assert!(line.contains(word), "{line:?} lacks {word:?}");
-            }
-        };
-        check(0.0, "", None, &["0 updates"]);
-        check(1.0, "the disk is full", None, &["00:01 warning: the disk is full"]);
-        check(2.0, "the disk is full", None, &[]);
-        check(3.0, "a worker is silent", Some(4), &["a worker is silent", "success 0.500"]);
-        check(4.0, "", Some(4), &["00:04 the problem is solved"]);
-        check(32.0, "", Some(4), &[]);
-        check(33.0, "", Some(4), &["0 updates"]);
     }
 }

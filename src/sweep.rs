@@ -23,7 +23,7 @@ use tandem_core::text::counted;
 use tandem_core::{Task, World};
 use tandem_dashboard::Site;
 use tandem_net::is_exposed;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
@@ -54,10 +54,6 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     if out.join("run.toml").exists() {
         return Err(Failed::usage(format!("{} holds a run: choose another --out", out.display())));
     }
-    let lock = match args.dry_run {
-        true => None,
-        false => Some(lock(&out, args.only.is_some()).or_cannot_write(String::new)?),
-    };
     let mut statuses = Vec::new();
     let mut refused = Vec::new();
     for run in runs {
@@ -80,6 +76,8 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
         output::message(note);
     }
     let address = dashboard::address(&args.dashboard)?;
+    // A refused sweep leaves no files. Each run is checked again when it is started.
+    let lock = lock(&out, args.only.is_some()).or_cannot_write(String::new)?;
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     let end = runtime.block_on(async {
         let interrupted = signals::shutdown_token(false)?;
@@ -158,7 +156,7 @@ fn refuse(refused: &[String], out: &Path) -> Result<(), Failed> {
     )))
 }
 
-/// How a sweep ended.
+/// The end of a sweep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum SweepEnd {
     /// Every run has ended.
@@ -178,9 +176,11 @@ struct Sweep<'a> {
     /// The server of the environments of all runs.
     environment: &'a EnvironmentArgs,
     display: Display,
-    /// What the dashboard shows, if there is one.
+    /// Lines of runs for the user, at most one of each.
+    lines: (mpsc::Sender<String>, mpsc::Receiver<String>),
+    /// The content of the dashboard, if there is one.
     board: Option<Board>,
-    /// Whether each run serves a dashboard of its own, to which that of the sweep links.
+    /// True if each run serves a dashboard of its own, to which that of the sweep links.
     runs_have_dashboards: bool,
 }
 
@@ -204,9 +204,10 @@ impl<'a> Sweep<'a> {
         if n_extended > 0 {
             display.print(&format!("{} to a larger stop.max_env_steps", extends(n_extended)));
         }
+        let lines = mpsc::channel(statuses.len().max(1));
         let board = None;
         let runs_have_dashboards = false;
-        Self { statuses, waiting, n_jobs, environment, display, board, runs_have_dashboards }
+        Self { statuses, waiting, n_jobs, environment, display, lines, board, runs_have_dashboards }
     }
 
     /// Serves the dashboard until the returned value is dropped; without a free port, there is none.
@@ -257,6 +258,7 @@ impl<'a> Sweep<'a> {
                     let (idx, outcome) = joined.or_exit(Exit::Bug, String::new)?;
                     self.handle_outcome(idx, outcome)?;
                 }
+                Some(line) = self.lines.1.recv() => self.display.print(&line),
                 _ = refresh.tick() => {
                     self.display.refresh();
                     if let Some(board) = &mut self.board {
@@ -327,7 +329,8 @@ impl<'a> Sweep<'a> {
             board.started(idx, progress);
         }
         let stop = interrupted.clone();
-        running.spawn(async move { (idx, run.run(stop, sender).await) });
+        let lines = self.lines.0.clone();
+        running.spawn(async move { (idx, run.run(stop, sender, lines).await) });
         Ok(())
     }
 
@@ -353,6 +356,11 @@ impl<'a> Sweep<'a> {
                 if let Err(error) = status.fail(why) {
                     self.display.print(&format!("{name}: the cause is not saved: {error:#}"));
                 }
+            }
+            RunOutcome::InUse => {
+                let why = format!("another process still uses {}", status.dir.display());
+                self.display.ended(&name, &format!("left out: {why}"));
+                status.skip(why);
             }
             RunOutcome::Interrupted => self.display.print(&format!("{name}: interrupted")),
         }
@@ -450,14 +458,12 @@ fn failures(statuses: &[RunStatus]) -> Result<(), Failed> {
 }
 
 fn print_resume_command(args: &SweepArgs, out: &Path, end: SweepEnd) {
-    let mut options = match args.only {
+    let options = match args.only {
         Some(only) => format!(" --only {only}"),
         None if args.jobs > 1 => format!(" --jobs {}", args.jobs),
         None => String::new(),
     };
-    if args.dashboard.no_dashboard {
-        options.push_str(" --no-dashboard");
-    }
+    let options = format!("{options}{}", args.dashboard.shell_words());
     output::message(match end {
         SweepEnd::Saving => {
             "interrupted; runs may still be saving, which the next start waits for. Resume with:"

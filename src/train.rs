@@ -7,6 +7,7 @@ mod policy_server;
 mod processes;
 mod progress_stream;
 mod restart_policy;
+mod resume_command;
 pub(crate) mod run_lock;
 mod summary;
 pub(crate) mod teacher_file;
@@ -15,17 +16,17 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use tandem_core::text::counted;
+use tandem_learner::INTERRUPTED;
 use tandem_proto::pb;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::cli::TrainArgs;
+use crate::cli::{RecordedName, TrainArgs};
 use crate::columns::wrapped;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::live::LiveRun;
 use crate::progress_json::progress_json;
 use crate::run_display::Display;
-use crate::shell::shell_word;
 use crate::{
     clock, environment_file, environment_server, metrics, output, run_directory, runtime,
     served_task, settings_page, signals,
@@ -34,25 +35,29 @@ use inputs::RunInputs;
 use plan::Plan;
 use processes::{PeakMemory, RunFailure, RunProcesses, Saved};
 use progress_stream::ProgressUpdate;
+use resume_command::resume_command;
 use run_lock::RunLock;
 
 /// Timeout of the start of all processes.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 /// Time that the learner has to finish the updates of a round, save and exit.
 const END_TIMEOUT: Duration = Duration::from_mins(10);
-/// What is printed when that was not enough.
+/// Message if the learner exceeds this timeout.
 const NOT_SAVED: &str = "the learner did not save within 10 minutes and was killed: a resumed run continues from \
                          its last checkpoint";
 /// Time between two checks of the processes.
 const CHECK_EVERY: Duration = Duration::from_millis(100);
 /// Time between two samples of their memory.
 const SAMPLE_EVERY: Duration = Duration::from_millis(500);
-/// End reason of an interrupted run.
-const INTERRUPTED: &str = "interrupted";
 
 pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
     if args.list_settings {
         return settings_page::print(args.json);
+    }
+    if args.live.live.is_some() && args.recording.record == RecordedName::None {
+        return Err(Failed::usage(
+            "--live shows recorded episodes: choose --record evaluation or --record all",
+        ));
     }
     let environment = environment_file::environment_of(args)?;
     let served = served_task::of_server(&environment)?;
@@ -85,7 +90,7 @@ pub(crate) fn train(args: &TrainArgs) -> Result<(), Failed> {
         ));
     }
     if last.end_reason == INTERRUPTED {
-        summary::print_interrupted(&plan);
+        summary::print_interrupted(&plan, args);
         return Err(Failed::new(Exit::Interrupted, anyhow!(INTERRUPTED)));
     }
     if former_round == Some(last.round) {
@@ -106,9 +111,9 @@ async fn run(
 ) -> Result<(pb::Progress, PeakMemory), Failed> {
     let mut display = Display::new(args.quiet);
     announce(plan, &display);
-    let mut processes = RunProcesses::new(plan).or_cannot_write(String::new)?;
+    let mut processes = RunProcesses::new((plan, lock)).or_cannot_write(String::new)?;
     let started = tokio::select! {
-        started = start(plan, &mut processes, &display) => started,
+        started = start(&mut processes, &display) => started,
         () = interrupted.cancelled() => Ok(()),
     };
     let last = match started {
@@ -119,7 +124,7 @@ async fn run(
             {
                 display.print(&failed.line());
             }
-            let mut supervisor = Supervisor::new((plan, lock), &mut processes, &mut display);
+            let mut supervisor = Supervisor::new(plan, &mut processes, &mut display);
             supervisor.prints_json = args.progress_json;
             supervisor.run(interrupted).await
         }
@@ -137,13 +142,13 @@ async fn run(
         display.print(NOT_SAVED);
     }
     let last = last.map_err(|RunFailure { exit, error }| {
-        Failed::new(exit, error.context(failure_context(plan, exit)))
+        Failed::new(exit, error.context(failure_context((plan, args), exit)))
     })?;
     if interrupted.is_cancelled()
         && let Saved::Failed(why) = saved
     {
         let exit = Exit::TryAgain;
-        return Err(Failed::new(exit, anyhow!(why)).context(failure_context(plan, exit)));
+        return Err(Failed::new(exit, anyhow!(why)).context(failure_context((plan, args), exit)));
     }
     if last.ended && !interrupted.is_cancelled() {
         return Ok((last, processes.peak_memory()));
@@ -171,36 +176,30 @@ fn announce(plan: &Plan, display: &Display) {
 }
 
 /// Starts all processes in time.
-async fn start(
-    plan: &Plan,
-    processes: &mut RunProcesses,
-    display: &Display,
-) -> Result<(), RunFailure> {
-    let started = tokio::time::timeout(START_TIMEOUT, processes.start(plan, display)).await;
+async fn start(processes: &mut RunProcesses<'_>, display: &Display) -> Result<(), RunFailure> {
+    let started = tokio::time::timeout(START_TIMEOUT, processes.start(display)).await;
     started.unwrap_or_else(|_elapsed| {
         Err(anyhow!("a process did not print its address within {START_TIMEOUT:?}").into())
     })
 }
 
 /// Describes how to resume the run, if that can help, and which log to read.
-fn failure_context(plan: &Plan, exit: Exit) -> String {
-    let (log, out) = (plan.log_path(), shell_word(&plan.out));
+fn failure_context((plan, args): (&Plan, &TrainArgs), exit: Exit) -> String {
+    let log = plan.log_path();
     let log = log.display();
     match exit {
         Exit::TryAgain => {
-            format!(
-                "the run was interrupted, resume it with `tandem train --resume --out {out}`; see {log}"
-            )
+            let command = resume_command(&plan.out, args);
+            format!("the run was interrupted, resume it with `{command}`; see {log}")
         }
         _ => format!("the run cannot continue; see {log}"),
     }
 }
 
 /// Supervises a run: displays its progress and restarts its processes.
-struct Supervisor<'a> {
+struct Supervisor<'a, 'run> {
     plan: &'a Plan,
-    lock: &'a RunLock,
-    processes: &'a mut RunProcesses,
+    processes: &'a mut RunProcesses<'run>,
     display: &'a mut Display,
     last: pb::Progress,
     /// The stream that delivered the latest message.
@@ -210,19 +209,18 @@ struct Supervisor<'a> {
     started_at: Instant,
     /// Seconds that the run had taken before this start, once a message has reported them.
     earlier_wall_s: Option<f64>,
-    /// Whether every message is printed as JSON.
+    /// True if every message is printed as JSON.
     prints_json: bool,
 }
 
-impl<'a> Supervisor<'a> {
+impl<'a, 'run> Supervisor<'a, 'run> {
     fn new(
-        (plan, lock): (&'a Plan, &'a RunLock),
-        processes: &'a mut RunProcesses,
+        plan: &'a Plan,
+        processes: &'a mut RunProcesses<'run>,
         display: &'a mut Display,
     ) -> Self {
         Self {
             plan,
-            lock,
             processes,
             display,
             last: pb::Progress::default(),
@@ -269,7 +267,10 @@ impl<'a> Supervisor<'a> {
         if progress.task.is_empty() || (progress.ended && progress.digest.is_empty()) {
             return;
         }
-        self.stream = stream;
+        if is_new_stream {
+            self.stream = stream;
+            self.display.begin_stream();
+        }
         if self.last.task.is_empty() {
             // The learner has loaded its checkpoint, so the run continues.
             self.processes.run_file_is_written();
@@ -302,9 +303,9 @@ impl<'a> Supervisor<'a> {
         drop(output::print(message));
     }
 
-    /// Restarts processes that have ended. Returns whether the learner was interrupted.
+    /// Restarts processes that have ended. Returns true if the learner was interrupted.
     fn check_processes(&mut self) -> Result<bool, RunFailure> {
-        let events = self.processes.check(self.plan, self.lock)?;
+        let events = self.processes.check()?;
         events.lines.iter().for_each(|line| self.display.print(line));
         self.awaits_learner |= events.learner_restarted;
         Ok(events.interrupted)

@@ -173,7 +173,7 @@ fn an_interrupted_run_remembers_its_server_and_ends_with_the_same_digest() {
     assert!(Command::new("kill").args(["-INT", &pid]).status().expect("kill runs").success());
     let interrupted = started.wait_with_output().expect("ends");
     assert_eq!(interrupted.status.code(), Some(130), "{}", stderr(&interrupted));
-    let line = format!("  tandem train --resume --out {}\n", out.display());
+    let line = format!("  tandem train --resume --out {} --workers 2\n", out.display());
     assert!(stderr(&interrupted).contains(&line), "{}", stderr(&interrupted));
     server.answer_only(usize::MAX);
     let resumed = run(&["train", "--json", "--resume", "--out", text(&out)]);

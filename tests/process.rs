@@ -386,6 +386,32 @@ fn a_run_directory_leads_to_the_learner_of_its_run_and_to_no_other_program() {
 }
 
 #[test]
+fn a_watcher_follows_a_run_across_restarts_and_reports_its_interruption() {
+    let (_keep, out) = run_directory();
+    let run = start_with("1", LONG, &[], &out);
+    let is_shown = || status(&out).0 == Some(0);
+    assert!(eventually(is_shown), "{:?}", status(&out));
+    let mut watcher = Command::new(env!("CARGO_BIN_EXE_tandem"));
+    watcher.arg("status").arg(&out).arg("--watch").stdin(Stdio::null());
+    let mut watcher =
+        watcher.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
+    let lines = BufReader::new(watcher.stdout.take().expect("piped")).lines();
+    // The reader of the lines runs on, so that the watcher is never blocked.
+    let (sender, first) = std::sync::mpsc::channel();
+    let lines = lines.map_while(Result::ok);
+    let reader = std::thread::spawn(move || lines.for_each(|line| drop(sender.send(line))));
+    first.recv().expect("the watcher has reached the learner");
+    kill_one(&run, "learner");
+    assert!(eventually(is_shown), "the restarted learner: {:?}", status(&out));
+    assert!(watcher.try_wait().expect("a child").is_none(), "the watcher waits for the restart");
+    signal("-INT", run.id());
+    assert_eq!(finish(run).status.code(), Some(130));
+    let watched = finish(watcher);
+    reader.join().expect("reads to the end");
+    assert_eq!(watched.status.code(), Some(75), "{}", stderr(&watched));
+}
+
+#[test]
 fn children_end_when_their_parent_is_killed() {
     let (_keep, out) = run_directory();
     let mut run = start("1", &out);

@@ -30,4 +30,4 @@ pub mod work_queue;
 pub use error::Error;
 pub use service::{LingerPolicy, ServeOptions, serve, serve_with};
 pub use shared::{Clock, LearnerConfig};
-pub use training_loop::RunOutcome;
+pub use training_loop::{INTERRUPTED, RunOutcome};

@@ -35,10 +35,13 @@ const WAIT_TICK: Duration = Duration::from_millis(200);
 /// Workers that are logged by name if they fall silent at the same time.
 const MAX_SILENT_LINES: usize = 100;
 
+/// The end reason of a run that was interrupted.
+pub const INTERRUPTED: &str = "interrupted";
+
 /// The outcome of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunOutcome {
-    /// The limit that ended the run, or `interrupted`.
+    /// The limit that ended the run, or [`INTERRUPTED`].
     pub reason: String,
     /// True if the run was stopped before its end and can be resumed.
     pub interrupted: bool,
@@ -66,7 +69,7 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
     let account = match account {
         Err(Error::Teacher(TeacherError::Stopped)) => {
             let (round, digest) = (initial.trainer.counters().round, initial.trainer.digest());
-            let reason = "interrupted".to_owned();
+            let reason = INTERRUPTED.to_owned();
             RunFinished { reason: &reason, round, digest: &digest }.emit();
             return Ok(RunOutcome { reason, interrupted: true, digest });
         }
@@ -325,7 +328,7 @@ impl LearnerLoop<'_> {
             }
         };
         let interrupted = reached.is_none();
-        let reason = reached.unwrap_or_else(|| "interrupted".to_owned());
+        let reason = reached.unwrap_or_else(|| INTERRUPTED.to_owned());
         self.save();
         let digest = self.trainer.digest();
         RunFinished { reason: &reason, round, digest: &digest }.emit();

@@ -21,7 +21,7 @@ const BASE_MARGIN_M: f64 = 0.14;
 /// Smallest distance from the camera, metres.
 const NEAREST_M: f64 = 0.1;
 
-/// Where points of the world are in the picture of a scene, which [`render`](crate::render) draws.
+/// The positions of points of the world in the picture of a scene, which [`render`](crate::render) draws.
 pub struct View(Camera);
 
 impl View {

@@ -39,7 +39,7 @@ const SPEEDS: std::ops::RangeInclusive<f64> = 0.05..=20.0;
 pub struct FilmStep {
     /// The world.
     pub scene: Scene,
-    /// Which arms' goals are achieved, in arm order.
+    /// True for each arm whose goal is achieved, in arm order.
     pub achieved: Vec<bool>,
 }
 

@@ -1,4 +1,4 @@
-//! How far the bodies of a scene have moved.
+//! Displacements of the bodies of a scene.
 
 use tandem_core::reward::distance;
 use tandem_core::scene::{Cuboid, Scene};

@@ -129,13 +129,13 @@ struct Goal {
     is_achieved: bool,
 }
 
-/// What a ray meets.
+/// The surface that a ray meets.
 struct Sample {
     color: Rgb,
     surface: Surface,
 }
 
-/// What distinguishes the surfaces between which edges are smoothed.
+/// The properties that distinguish surfaces: edges between different ones are smoothed.
 #[derive(Clone, Copy)]
 struct Surface {
     body: Option<u16>,

@@ -1,11 +1,11 @@
-//! Tiles of a picture, and what may be seen in each: a ray is compared with few bodies instead of all.
+//! Tiles of a picture, and the bodies that may be visible in each: a ray is compared with few bodies instead of all.
 
 use crate::camera::Rectangle;
 
 /// Width and height of a tile, pixels.
 const TILE_PX: usize = 16;
 
-/// What may be seen in a tile, as ascending indices.
+/// The things that may be visible in a tile, as ascending indices.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Tile {
     pub(crate) bodies: Vec<usize>,

@@ -17,8 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         curve_svg(&series, &CurveOptions::of("Two arms push", Quantity::Success, Axis::EnvSteps))?,
     )?;
     let metrics_path = dir.join("metrics.jsonl");
-    std::fs::File::create(&metrics_path)?;
-    let mut metrics = MetricsLog::open(&metrics_path)?;
+    let (mut metrics, _) = MetricsLog::restore(&metrics_path, &[])?;
     rows(1.0).iter().try_for_each(|row| metrics.append(row))?;
     std::fs::write(dir.join("run.toml"), "task = \"push\"\narms = 2\n")?;
     run_report_html(&dir, &[])?;

@@ -1,17 +1,22 @@
 //! Comparison of runs: the tables of a report, in one section for each task and number of arms.
 
+use tandem_core::Wilson;
+
 use crate::group::{MILESTONES, SeedGroup, TaskSetup, group_by_settings};
 use crate::measures::CostOf;
 use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::table::{NONE, Table, share_spread, short_number, spread, wrapped};
+use crate::table::{NONE, Table, paragraph, share_spread, short_number, spread};
 use crate::test_evaluation::TestEvaluation;
 
 mod contents;
 mod paper_table;
 mod summary;
+mod values;
 
 pub use paper_table::paper_table;
+use values::{advice_queries, advice_spent, best_success, collision_rate, env_steps, test_success};
+pub(crate) use values::{success_joint, success_without_contact, test_collision_rate};
 
 /// Runs and baselines, by task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +25,8 @@ pub struct Comparison {
     pub sections: Vec<Section>,
     /// Film strips of episodes.
     pub films: Vec<FilmStrip>,
+    /// One line for each problem that limits what the values mean.
+    pub warnings: Vec<String>,
 }
 
 /// A film strip of an episode, for the page of a report.
@@ -65,11 +72,14 @@ pub struct Baseline {
 }
 
 impl Comparison {
-    /// Compares `runs` with each other and with `baselines`.
+    /// Compares `runs` with each other and with `baselines`. Copies of a run add to the warnings and are left out.
     #[must_use]
     pub fn of(runs: Vec<Run>, baselines: Vec<Baseline>) -> Self {
         let mut sections: Vec<Section> = Vec::new();
-        for group in group_by_settings(runs) {
+        let mut warnings = Vec::new();
+        for mut group in group_by_settings(runs) {
+            warnings.extend(group.remove_copies());
+            warnings.extend(group.repetition_warning());
             match sections.iter_mut().find(|section| section.setup == group.setup) {
                 Some(section) => section.groups.push(group),
                 None => sections.push(Section {
@@ -83,7 +93,7 @@ impl Comparison {
             add_baseline(&mut sections, baseline);
         }
         sections.sort_by_key(|section| section.setup.sort_key());
-        Self { sections, films: Vec::new() }
+        Self { sections, films: Vec::new(), warnings }
     }
 
     /// Formats the tables of all values as Markdown.
@@ -98,8 +108,8 @@ impl Comparison {
     pub fn notes(&self) -> String {
         let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, \
              ranges and all intervals.";
-        let legend = if self.is_in_paper() { wrapped(LEGEND) } else { String::new() };
-        format!("{}{legend}", wrapped(notes)).trim_end().to_owned()
+        let legend = if self.is_in_paper() { paragraph(LEGEND) } else { String::new() };
+        format!("{}{legend}", paragraph(notes)).trim_end().to_owned()
     }
 
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
@@ -108,7 +118,7 @@ impl Comparison {
         let sections = self.sections.iter().map(|section| {
             let tables = section.summaries();
             let texts: Vec<String> = tables.iter().map(Table::text).collect();
-            let hint = section.hint().map(|hint| format!("\n{}", wrapped(&hint)));
+            let hint = section.hint().map(|hint| format!("\n{}", paragraph(&hint)));
             format!("{}{}", texts.join("\n"), hint.unwrap_or_default())
         });
         sections.collect::<Vec<_>>().join("\n")
@@ -271,20 +281,6 @@ impl Section {
     }
 }
 
-/// Returns the success on test goals and their number.
-fn test_success(run: &Run) -> Option<(f64, u64)> {
-    run.test.as_ref().map(|test| (test.success, test.n_episodes))
-}
-
-/// Returns the success of the best policy of a run, on the goals that selected it, and the number of its episodes.
-fn best_success(run: &Run) -> Option<(f64, u64)> {
-    run.best().map(|row| (row.success, row.n_episodes))
-}
-
-fn env_steps(run: &Run) -> Option<f64> {
-    Some(run.last()?.env_steps as f64)
-}
-
 /// Returns the title of a table of costs.
 fn cost_title(section: &Section, measure: Quantity) -> String {
     let of_what = match measure {
@@ -294,46 +290,14 @@ fn cost_title(section: &Section, measure: Quantity) -> String {
     format!("{}: cost of reaching a rate of {of_what}", section.setup.title())
 }
 
-/// Returns the number of steps on which the teacher was asked.
-fn advice_queries(run: &Run) -> Option<f64> {
-    Some(run.last()?.advice_queries? as f64)
-}
-
-fn advice_spent(run: &Run) -> Option<f64> {
-    Some(run.last()?.advice_spent as f64)
-}
-
-/// Returns the success by the joint norm, on test goals or else of the last evaluation.
-fn success_joint(run: &Run) -> Option<f64> {
-    let test = run.test.as_ref().map(|test| test.success_joint);
-    test.or_else(|| run.last().map(|row| row.success_joint))
-}
-
-/// Returns the success without contact between the arms on test goals, and their number, if it is known.
-pub(crate) fn success_without_contact(run: &Run) -> Option<(f64, u64)> {
-    let test = run.test.as_ref()?;
-    Some((test.contacts.success_without_contact?, test.n_episodes))
-}
-
-/// Returns the share of episodes with a contact, on test goals or else of the last evaluation.
-///
-/// A task that reports no contacts has no such share.
-fn collision_rate(run: &Run) -> Option<f64> {
-    if !run.reports_contacts() {
-        return None;
-    }
-    let test = run.test.as_ref().and_then(|test| test.collision_rate);
-    test.or_else(|| run.last().map(|row| row.collision_rate))
-}
-
 fn baseline_row(Baseline { label, test }: &Baseline, reports_contacts: bool) -> Vec<String> {
-    let (low, high) = test.interval;
+    let Wilson { low, high } = test.interval;
     let none = || NONE.to_owned();
     vec![
         label.clone(),
         none(),
         format!("{:.3} [{low:.3}, {high:.3}]", test.success),
-        test.contacts.success().map_or_else(none, |[success, low, high]| {
+        test.contacts.success().map_or_else(none, |(success, Wilson { low, high })| {
             format!("{success:.3} [{low:.3}, {high:.3}]")
         }),
         none(),
@@ -385,9 +349,11 @@ mod tests {
         Run {
             name: format!("{task}-{}-seed{seed}", strategy.replace(':', "-")),
             rows: (1..).zip(successes).map(row).collect(),
-            configuration: Some(format!(
+            configuration: format!(
                 "task = \"{task}\"\narms = 2\nseed = {seed}\n[advice]\nstrategy = \"{strategy}\""
-            )),
+            )
+            .parse()
+            .ok(),
             ..Run::default()
         }
     }
@@ -398,7 +364,7 @@ mod tests {
             n_arms: 2,
             n_episodes: 240,
             success: 0.958,
-            interval: (0.925, 0.977),
+            interval: Wilson { low: 0.925, high: 0.977 },
             success_joint: 0.908,
             collision_rate: Some(0.175),
             contacts: ContactMetrics::default(),

@@ -45,6 +45,14 @@ pub enum Error {
         /// The missing or invalid part.
         problem: String,
     },
+    /// A `summary.json` is not the summary of a run.
+    #[error("{path:?} is not the summary of a run: {problem}")]
+    InvalidSummary {
+        /// Path of the file.
+        path: PathBuf,
+        /// The missing or invalid part.
+        problem: String,
+    },
     /// A curve could not be drawn.
     #[error("cannot draw the curve {title:?}: {problem}")]
     Draw {

@@ -4,11 +4,14 @@ use serde_json::{Value, json};
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::comparison::{Comparison, Section, success_without_contact};
-use crate::group::{MILESTONES, SeedGroup, Spread};
+use crate::comparison::{
+    Comparison, Section, success_joint, success_without_contact, test_collision_rate,
+};
+use crate::group::{MILESTONES, SeedGroup};
 use crate::measures::{CostOf, LearningMeasures, first_reaching};
 use crate::quantity::Quantity;
 use crate::run::Run;
+use crate::spread::Spread;
 
 /// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
 ///
@@ -69,8 +72,8 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
     cells.push(number(last.filter(|_| has_contacts).map(|row| row.collision_rate)));
     cells.extend([
         number(test.map(|test| test.success)),
-        number(test.map(|test| test.interval.0)),
-        number(test.map(|test| test.interval.1)),
+        number(test.map(|test| test.interval.low)),
+        number(test.map(|test| test.interval.high)),
         number(test.filter(|_| has_contacts).and_then(|test| test.collision_rate)),
         number(test.and_then(|test| test.contacts.success_without_contact)),
         number(test.and_then(|test| test.contacts.arm_contact_rate)),
@@ -101,7 +104,7 @@ fn section_json(section: &Section) -> Value {
         let test = &baseline.test;
         json!({
             "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
-            "success_low": test.interval.0, "success_high": test.interval.1,
+            "success_low": test.interval.low, "success_high": test.interval.high,
             "success_joint": test.success_joint,
             "collision_rate": test.collision_rate.filter(|_| reports_contacts),
             "success_without_contact": test.contacts.success_without_contact,
@@ -149,6 +152,8 @@ fn group_json(group: &SeedGroup) -> Value {
             run.test.as_ref().map(|test| (test.success, test.n_episodes))
         }),
         "held_out_success_without_contact": share_json(group, success_without_contact),
+        "held_out_collision_rate": share_json(group, test_collision_rate),
+        "success_joint": spread_json(&group.spread(success_joint)),
         "collision_rate": share_json(group, |run| {
             let last = run.last().filter(|_| run.reports_contacts());
             last.map(|row| (row.collision_rate, row.n_episodes))
@@ -189,7 +194,10 @@ fn share_json(group: &SeedGroup, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> V
 
 #[cfg(test)]
 mod tests {
+    use tandem_telemetry::ContactMetrics;
+
     use super::*;
+    use crate::test_evaluation::TestEvaluation;
 
     fn comparison() -> Comparison {
         let row = |(idx, success): (u64, f64)| MetricsRow {
@@ -203,9 +211,9 @@ mod tests {
         let run = Run {
             name: "odd, name-seed3".to_owned(),
             rows: vec![row((1, 0.25)), row((2, 0.5))],
-            configuration: Some(
-                "task = \"push\"\narms = 2\nseed = 3\n[advice]\nstrategy = \"ea\"".to_owned(),
-            ),
+            configuration: "task = \"push\"\narms = 2\nseed = 3\n[advice]\nstrategy = \"ea\""
+                .parse()
+                .ok(),
             ..Run::default()
         };
         Comparison::of(
@@ -237,5 +245,27 @@ mod tests {
         assert_eq!(group["last_success"]["mean"], 0.5);
         assert_eq!(group["last_success"]["low"], json!(Wilson::of(120, 240).low));
         assert!(group["held_out_success"].is_null());
+    }
+
+    #[test]
+    fn json_has_the_contacts_and_the_joint_goal_of_the_tables() {
+        let mut compared = comparison();
+        let [tested] = &mut compared.sections[0].groups[0].runs[..] else { panic!("one run") };
+        tested.test = Some(TestEvaluation {
+            task: "push".to_owned(),
+            n_arms: 2,
+            n_episodes: 240,
+            success: 0.5,
+            interval: Wilson::of(120, 240),
+            success_joint: 0.25,
+            collision_rate: Some(0.125),
+            contacts: ContactMetrics::default(),
+        });
+        let value = json(&compared);
+        let group = &value["sections"][0]["groups"][0];
+        assert_eq!(group["held_out_collision_rate"]["mean"], 0.125);
+        assert_eq!(group["held_out_collision_rate"]["low"], json!(Wilson::of(30, 240).low));
+        assert_eq!(group["success_joint"]["mean"], 0.25);
+        assert_eq!(group["collision_rate"]["mean"], 0.0, "of the last evaluation");
     }
 }

@@ -1,5 +1,7 @@
 //! Groups of runs that differ only in their seed, and statistics over them.
 
+mod labels;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use tandem_core::{Task, Wilson};
@@ -10,14 +12,12 @@ use crate::measures::{LearningMeasures, first_reaching};
 use crate::paper::PaperRow;
 use crate::quantity::Quantity;
 use crate::run::Run;
+use crate::spread::{Spread, pooled_interval};
 
 /// Success rates for which reports give the cost of reaching them.
 pub const MILESTONES: [f64; 3] = [0.5, 0.9, 0.95];
 /// Settings in which runs of one group may differ, besides the number of recorded episodes. None affects a result.
 const FREE_SETTINGS: [&str; 3] = ["name", "seed", "checkpoint"];
-
-/// Number of settings in a label at most.
-const MAX_DIFFERENCES: usize = 3;
 
 /// Task and number of arms. Runs with the same task setup share tables. Unknown values sort last.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -29,8 +29,8 @@ pub struct TaskSetup {
 }
 
 impl TaskSetup {
-    fn of(run: &Run, settings: &Table) -> Self {
-        let n_arms = settings.get("arms").and_then(Value::as_integer);
+    fn of(run: &Run) -> Self {
+        let n_arms = run.setting("arms").and_then(Value::as_integer);
         Self { task: run.task(), n_arms: n_arms.and_then(|n| u64::try_from(n).ok()) }
     }
 
@@ -110,7 +110,7 @@ pub fn group_by_settings(runs: Vec<Run>) -> Vec<SeedGroup> {
     groups.sort_by_key(|group| {
         (group.setup.sort_key(), group.paper_index().unwrap_or(usize::MAX), group.label.clone())
     });
-    distinguish_labels(&mut groups);
+    labels::distinguish(&mut groups);
     groups
 }
 
@@ -123,9 +123,10 @@ fn settings_key(run: &Run) -> String {
     }
 }
 
-/// Returns the settings in which runs of one group are equal.
+/// Returns the settings in which runs of one group are equal, among them the digest of the teacher. Empty if they are
+/// unknown.
 fn compared_settings(run: &Run) -> Table {
-    let mut settings = run.settings();
+    let mut settings = run.settings_with_teacher();
     for free in FREE_SETTINGS {
         settings.remove(free);
     }
@@ -137,94 +138,26 @@ fn compared_settings(run: &Run) -> Table {
     settings
 }
 
-/// Distinguishes equal labels within a task setup by the settings that differ, such as `ea, ddpg.discount=0.9`. Groups
-/// without such settings are numbered: `NAME (#2)`.
-fn distinguish_labels(groups: &mut [SeedGroup]) {
-    let labels: Vec<String> = groups.iter().map(|group| group.label.clone()).collect();
-    for idx in 0..groups.len() {
-        let is_same = |other: &usize| {
-            labels[*other] == labels[idx] && groups[*other].setup == groups[idx].setup
-        };
-        let same: Vec<usize> = (0..groups.len()).filter(is_same).collect();
-        if same.len() > 1 {
-            groups[idx].label = format!("{}{}", labels[idx], differences(groups, idx, &same));
-        }
-    }
-    number_duplicate_labels(groups);
-}
-
-/// Returns the settings in which group `idx` differs from the groups `same`, as an addition to their label.
-fn differences(groups: &[SeedGroup], idx: usize, same: &[usize]) -> String {
-    let settings = |idx: usize| -> BTreeMap<String, String> {
-        let mut flat = BTreeMap::new();
-        if let Some(run) = groups[idx].runs.first() {
-            flatten("", &Value::Table(compared_settings(run)), &mut flat);
-        }
-        flat
-    };
-    let all: Vec<BTreeMap<String, String>> = same.iter().map(|other| settings(*other)).collect();
-    let own = settings(idx);
-    let keys: BTreeSet<&String> = all.iter().flat_map(BTreeMap::keys).collect();
-    let differs = |key: &&&String| all.iter().any(|other| other.get(**key) != own.get(**key));
-    let differing: Vec<&String> = keys.iter().filter(differs).copied().collect();
-    let shown = differing.iter().take(MAX_DIFFERENCES).map(|key| {
-        let value = own.get(*key).map_or("default", String::as_str);
-        format!(", {key}={value}")
-    });
-    let rest = if differing.len() > MAX_DIFFERENCES { ", …" } else { "" };
-    shown.chain([rest.to_owned()]).collect()
-}
-
-/// Adds the values of a table with their keys, joined by dots.
-fn flatten(prefix: &str, value: &Value, flat: &mut BTreeMap<String, String>) {
-    let Value::Table(table) = value else {
-        let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-        flat.insert(prefix.to_owned(), text);
-        return;
-    };
-    for (key, value) in table {
-        let path = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
-        flatten(&path, value, flat);
-    }
-}
-
-/// Numbers equal labels within a task setup from the second on: `NAME (#2)`.
-fn number_duplicate_labels(groups: &mut [SeedGroup]) {
-    for idx in 1..groups.len() {
-        let (before, rest) = groups.split_at_mut(idx);
-        let group = &mut rest[0];
-        let has_same_label = |other: &&SeedGroup| {
-            other.setup == group.setup
-                && other.label.split(" (#").next() == Some(group.label.as_str())
-        };
-        let n_same = before.iter().filter(has_same_label).count();
-        if n_same > 0 {
-            group.label = format!("{} (#{})", group.label, n_same + 1);
-        }
-    }
-}
-
 impl SeedGroup {
     fn of(run: Run) -> Self {
-        let settings = run.settings();
-        let setup = TaskSetup::of(&run, &settings);
-        let configured = settings
-            .get("advice")
+        let setup = TaskSetup::of(&run);
+        let configured = run
+            .setting("advice")
             .and_then(|advice| advice.get("strategy"))
             .and_then(Value::as_str)
             .map(str::to_owned);
-        let label = label(run.stem(), &setup, configured.as_deref());
-        let strategy = configured.or_else(|| strategy_from_name(run.stem()));
+        let label = labels::label(run.stem(), &setup, configured.as_deref());
+        let strategy = configured.or_else(|| labels::strategy_from_name(run.stem()));
         Self { label, setup, strategy, runs: vec![run] }
     }
 
-    /// Returns whether the strategy alone identifies these runs.
+    /// Returns true if the strategy alone identifies these runs.
     #[must_use]
     pub fn is_plain_strategy(&self) -> bool {
         self.strategy.as_ref() == Some(&self.label)
     }
 
-    /// Returns whether these runs got no advice.
+    /// Returns true if these runs got no advice.
     #[must_use]
     pub fn is_from_scratch(&self) -> bool {
         self.strategy.as_deref() == Some("none")
@@ -239,6 +172,41 @@ impl SeedGroup {
             self.setup.task.is_none() || self.setup.built_in().is_some_and(Task::is_in_paper);
         let strategy = self.strategy.as_ref().filter(|_| is_student && may_be_of_paper)?;
         Some(PaperRow::of(strategy)?.1)
+    }
+
+    /// Removes runs that have the digest of another, and returns a warning about each: a copy of a run, or its repetition
+    /// with the same bits, is no further seed.
+    pub(crate) fn remove_copies(&mut self) -> Vec<String> {
+        let (title, label) = (self.setup.title(), self.label.clone());
+        let mut counted: BTreeMap<String, String> = BTreeMap::new();
+        let mut warnings = Vec::new();
+        self.runs.retain(|run| {
+            let Some(digest) = &run.digest else { return true };
+            let original = counted.get(digest).cloned();
+            match &original {
+                Some(original) => warnings.push(format!(
+                    "{title}, {label}: {} has the settings and the digest of {original} and is not counted",
+                    run.name
+                )),
+                None => drop(counted.insert(digest.clone(), run.name.clone())),
+            }
+            original.is_none()
+        });
+        warnings
+    }
+
+    /// Returns a warning if some runs have the same seed.
+    pub(crate) fn repetition_warning(&self) -> Option<String> {
+        let seeds: Vec<u64> = self.runs.iter().filter_map(Run::seed).collect();
+        let n_repeated = seeds.len() - seeds.iter().collect::<BTreeSet<_>>().len();
+        (n_repeated > 0).then(|| {
+            format!(
+                "{}, {}: {n_repeated} of {} runs repeat the seed of another; all are counted, so the interval is too narrow",
+                self.setup.title(),
+                self.label,
+                self.runs.len()
+            )
+        })
     }
 
     fn paper_index(&self) -> Option<usize> {
@@ -266,7 +234,7 @@ impl SeedGroup {
         self.spread(|run| first_reaching(&run.rows, measure, success).and_then(&value))
     }
 
-    /// Returns whether the evaluations of all runs that have any contain the success without contact.
+    /// Returns true if the evaluations of all runs that have any contain the success without contact.
     pub(crate) fn has_success_without_contact(&self) -> bool {
         let is_known = |row: &MetricsRow| Quantity::SuccessWithoutContact.of(row).is_finite();
         let evaluated = |run: &&Run| !run.rows.is_empty();
@@ -278,96 +246,9 @@ impl SeedGroup {
     /// `pick` returns a run's share, in [0, 1], and the number of its episodes.
     pub fn share(&self, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> (Spread, Option<Wilson>) {
         let picked: Vec<(f64, u64)> = self.runs.iter().filter_map(pick).collect();
-        let n_episodes: u64 = picked.iter().map(|(_, n)| n).sum();
-        let n_hits: u64 = picked.iter().map(|(share, n)| hits(*share, *n)).sum();
-        let counts = usize::try_from(n_hits).ok().zip(usize::try_from(n_episodes).ok());
-        let interval = counts.filter(|(_, n)| *n > 0).map(|(hits, n)| Wilson::of(hits, n));
         let values: Vec<f64> = picked.iter().map(|(share, _)| *share).collect();
-        (Spread::of(&values, self.runs.len()), interval)
+        (Spread::of(&values, self.runs.len()), pooled_interval(&picked))
     }
-}
-
-/// Returns the number of episodes that a share corresponds to.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a share of few episodes, clamped"
-)]
-fn hits(share: f64, n_episodes: u64) -> u64 {
-    (share.clamp(0.0, 1.0) * n_episodes as f64).round() as u64
-}
-
-/// Mean and range of a value over the runs that have it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Spread {
-    /// Number of runs that have the value.
-    pub n: usize,
-    /// Number of runs of the group.
-    pub n_runs: usize,
-    /// Mean over the runs that have it; NaN if none has.
-    pub mean: f64,
-    /// Smallest value; NaN if no run has it.
-    pub min: f64,
-    /// Largest value; NaN if no run has it.
-    pub max: f64,
-}
-
-impl Spread {
-    /// Computes the spread of `values`, which belong to some of `n_runs` runs.
-    #[must_use]
-    pub fn of(values: &[f64], n_runs: usize) -> Self {
-        Self {
-            n: values.len(),
-            n_runs,
-            mean: values.iter().sum::<f64>() / values.len() as f64,
-            min: values.iter().copied().fold(f64::NAN, f64::min),
-            max: values.iter().copied().fold(f64::NAN, f64::max),
-        }
-    }
-}
-
-/// Returns the label of a table row: the strategy if it identifies the run, else the run name minus the task of the
-/// heading.
-fn label(stem: &str, setup: &TaskSetup, strategy: Option<&str>) -> String {
-    let task = setup.task.as_deref().unwrap_or_default();
-    // Directories have dashes in place of the `/` of a task's name.
-    let rest = without_prefix(stem, &task.replace('/', "-"));
-    let n_arms = setup.n_arms.map(|n| n.to_string()).unwrap_or_default();
-    let shortest = without_prefix(rest, &n_arms);
-    match strategy {
-        Some(strategy) if shortest == dashed(strategy) || rest == dashed(strategy) => {
-            strategy.to_owned()
-        }
-        _ => rest.to_owned(),
-    }
-}
-
-/// Removes `prefix-` from `text`, unless nothing would remain.
-fn without_prefix<'a>(text: &'a str, prefix: &str) -> &'a str {
-    if prefix.is_empty() {
-        return text;
-    }
-    text.strip_prefix(prefix)
-        .and_then(|rest| rest.strip_prefix('-'))
-        .filter(|rest| !rest.is_empty())
-        .unwrap_or(text)
-}
-
-/// Returns a strategy as it is written in directory names.
-fn dashed(strategy: &str) -> String {
-    strategy.replace(':', "-")
-}
-
-/// Returns the strategy of the paper's Table 2 with which a run name ends, for runs without a configuration.
-fn strategy_from_name(stem: &str) -> Option<String> {
-    let strategies = crate::paper::TABLE_2.iter().map(|row| match row.threshold {
-        Some(threshold) => format!("{}:{threshold}", row.strategy),
-        None => row.strategy.to_owned(),
-    });
-    let mut matching = strategies.filter(|strategy| {
-        stem.strip_suffix(&dashed(strategy)).is_some_and(|rest| rest.ends_with('-'))
-    });
-    matching.next()
 }
 
 #[cfg(test)]
@@ -387,7 +268,7 @@ mod tests {
         Run {
             name: name.to_owned(),
             rows: (1..).zip(successes).map(row).collect(),
-            configuration: (!settings.is_empty()).then(|| settings.to_owned()),
+            configuration: settings.parse().ok(),
             ..Run::default()
         }
     }
@@ -440,30 +321,6 @@ mod tests {
     }
 
     #[test]
-    fn groups_with_equal_labels_are_distinguished_by_the_settings_that_differ() {
-        let groups = group_by_settings(vec![
-            run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.9), &[]),
-            run("push-2-mc-q-0.1-seed1.2", &settings("mc-q:0.1", 1, 0.95), &[]),
-            run("push-2-mc-q-0.1-seed1", &settings("mc-q:0.1", 1, 0.98), &[]),
-        ]);
-        let labels: Vec<&str> = groups.iter().map(|group| group.label.as_str()).collect();
-        let discounts = ["0.9", "0.95", "0.98"];
-        assert_eq!(labels, discounts.map(|value| format!("mc-q:0.1, ddpg.discount={value}")));
-    }
-
-    #[test]
-    fn groups_without_different_settings_are_numbered() {
-        let different = |name: &str, copy: u64| {
-            run(name, &format!("task = \"push\"\narms = 2\nname = \"{copy}\""), &[])
-        };
-        let mut groups =
-            vec![SeedGroup::of(different("push-2-a", 1)), SeedGroup::of(different("push-2-a", 2))];
-        distinguish_labels(&mut groups);
-        let labels: Vec<&str> = groups.iter().map(|group| group.label.as_str()).collect();
-        assert_eq!(labels, ["2-a", "2-a (#2)"]);
-    }
-
-    #[test]
     fn a_milestone_has_mean_range_and_number_of_runs_that_reached_it() {
         let group = group_by_settings(vec![
             run("push-ea-seed1", &settings("ea", 1, 0.98), &[0.0, 0.3, 0.9, 0.96, 0.9]),
@@ -496,5 +353,34 @@ mod tests {
         assert_eq!((spread.mean, spread.min, spread.max), (0.625, 0.5, 0.75));
         assert_eq!(interval, Some(Wilson::of(120 + 180, 480)));
         assert_eq!(group.share(|_| None).1, None);
+    }
+
+    #[test]
+    fn a_copy_of_a_run_is_left_out_and_a_repeated_seed_is_reported() {
+        let with_digest = |name: &str, seed: u64, discount: f64, digest: &str| Run {
+            digest: Some(digest.to_owned()),
+            ..run(name, &settings("ea", seed, discount), &[0.5])
+        };
+        let of = |last: Run| {
+            let (one, two) =
+                (with_digest("a-seed1", 1, 0.98, "d1"), with_digest("b-seed2", 2, 0.98, "d2"));
+            let mut groups = group_by_settings(vec![one, two, last]);
+            let copies: Vec<String> =
+                groups.iter_mut().flat_map(SeedGroup::remove_copies).collect();
+            (groups, copies)
+        };
+        let (copied, warnings) = of(with_digest("copy", 1, 0.98, "d1"));
+        let names: Vec<&str> = copied[0].runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["a-seed1", "b-seed2"]);
+        let expected = "copy has the settings and the digest of a-seed1 and is not counted";
+        assert!(warnings.len() == 1 && warnings[0].ends_with(expected), "{warnings:?}");
+        assert_eq!(copied[0].repetition_warning(), None);
+        let (repeated, warnings) = of(with_digest("longer", 1, 0.98, "d3"));
+        assert_eq!((repeated[0].runs.len(), warnings.len()), (3, 0));
+        let warning = repeated[0].repetition_warning().unwrap();
+        assert!(warning.contains("1 of 3 runs repeat the seed of another"), "{warning}");
+        // Runs with other settings may end in the same state, such as strategies that never ask.
+        let (others, warnings) = of(with_digest("other", 1, 0.9, "d1"));
+        assert_eq!((others.len(), warnings.len()), (2, 0));
     }
 }

@@ -9,7 +9,10 @@ use tandem_telemetry::trials::TRIALS_FILE;
 use crate::error::Error;
 use crate::files::{InvalidLine, read_bytes, read_error, read_rows};
 use crate::run::Run;
+use crate::run_summary;
 
+/// The files of a run directory that are read.
+const RUN_FILES: [&str; 3] = ["metrics.jsonl", "run.toml", run_summary::FILE];
 /// Depth to which directories are searched.
 const MAX_DEPTH: usize = 6;
 
@@ -56,6 +59,15 @@ impl ReportInputs {
             self.warnings.push(format!("{} is named twice and counted once", path.display()));
         }
         is_new
+    }
+
+    /// Returns true if `path` is one of the files that were read: writing it would destroy an input.
+    #[must_use]
+    pub fn contains(&self, path: &Path) -> bool {
+        let Ok(path) = path.canonicalize() else { return false };
+        let is_of_run = path.parent().is_some_and(|parent| self.read.contains(parent));
+        let has_name = |name: &&str| path.file_name().is_some_and(|own| own == *name);
+        self.read.contains(&path) || (is_of_run && RUN_FILES.iter().any(has_name))
     }
 
     fn read_file(&mut self, path: &Path) -> Result<(), Error> {
@@ -109,6 +121,8 @@ impl ReportInputs {
 struct FoundPaths {
     run_dirs: Vec<PathBuf>,
     trials_files: Vec<PathBuf>,
+    /// The canonical paths of the directories that were searched: links may lead to one several times, or in circles.
+    searched: BTreeSet<PathBuf>,
 }
 
 /// The kind of directory that contains a searched one. Within a run directory, a metrics file alone does not make a
@@ -120,8 +134,11 @@ enum Parent {
 }
 
 impl FoundPaths {
-    /// Adds `dir` itself and its subdirectories, in alphabetical order.
+    /// Adds `dir` itself and its subdirectories, in alphabetical order. Links are followed.
     fn search(&mut self, dir: &Path, depth: usize, parent: Parent) -> Result<(), Error> {
+        if !self.searched.insert(dir.canonicalize().unwrap_or_else(|_| dir.to_owned())) {
+            return Ok(());
+        }
         let is_run = dir.join("metrics.jsonl").is_file()
             && (parent == Parent::Directory || dir.join("run.toml").is_file());
         if is_run {
@@ -133,10 +150,8 @@ impl FoundPaths {
         }
         let parent = if is_run { Parent::Run } else { parent };
         let entries = std::fs::read_dir(dir).map_err(read_error(dir))?;
-        let is_dir =
-            |entry: &std::fs::DirEntry| entry.file_type().is_ok_and(|file_type| file_type.is_dir());
-        let mut children: Vec<PathBuf> =
-            entries.flatten().filter(is_dir).map(|entry| entry.path()).collect();
+        let paths = entries.flatten().map(|entry| entry.path());
+        let mut children: Vec<PathBuf> = paths.filter(|path| path.is_dir()).collect();
         children.sort();
         for child in children.iter().filter(|_| depth > 0) {
             match self.search(child, depth - 1, parent) {
@@ -149,7 +164,7 @@ impl FoundPaths {
     }
 }
 
-/// Returns whether a single file contains trials, judging by its name or else by its first line.
+/// Returns true if a single file contains trials, judging by its name or else by its first line.
 fn is_trials_file(path: &Path) -> Result<bool, Error> {
     if path.file_name().is_some_and(|name| name == TRIALS_FILE) {
         return Ok(true);
@@ -219,6 +234,51 @@ mod tests {
         let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
         assert_eq!(names, ["runs", "b", "a", "deeper"]);
         assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn links_are_followed_and_a_run_that_they_lead_to_twice_is_counted_once() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = |name: &str| dir.path().join(name);
+        write(&path("disk/a/metrics.jsonl"), &line(1));
+        write(&path("runs/b/metrics.jsonl"), &line(1));
+        let link = |to: &str, name: &str| std::os::unix::fs::symlink(path(to), path(name)).unwrap();
+        link("disk/a", "runs/a");
+        link("runs/b", "runs/latest");
+        link("runs", "runs/b/up");
+        link("missing", "runs/broken");
+        let inputs = ReportInputs::load(&[path("runs")]).unwrap();
+        let names: Vec<&str> = inputs.runs.iter().map(|run| run.name.as_str()).collect();
+        assert_eq!(names, ["a", "b"]);
+        assert!(inputs.warnings.is_empty(), "{:?}", inputs.warnings);
+    }
+
+    #[test]
+    fn a_run_file_that_is_no_toml_adds_a_warning() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("a/metrics.jsonl"), &line(1));
+        write(&dir.path().join("a/run.toml"), "task = \n");
+        let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+        let [warning] = &inputs.warnings[..] else { panic!("{:?}", inputs.warnings) };
+        assert!(warning.contains("a/run.toml is not TOML ("), "{warning}");
+        assert_eq!((inputs.runs.len(), &inputs.runs[0].configuration), (1, &None));
+    }
+
+    #[test]
+    fn the_files_of_runs_and_trials_are_inputs() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = |name: &str| dir.path().join(name);
+        write(&path("a/metrics.jsonl"), &line(1));
+        write(&path("a/run.toml"), "");
+        write(&path("a/report.html"), "");
+        write(&path("b/trials.jsonl"), &trial(1));
+        let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
+        for name in ["a/metrics.jsonl", "a/run.toml", "a/../a/run.toml", "b/trials.jsonl"] {
+            assert!(inputs.contains(&path(name)), "{name}");
+        }
+        for name in ["a/report.html", "a/runs.csv", "run.toml"] {
+            assert!(!inputs.contains(&path(name)), "{name}");
+        }
     }
 
     #[test]

@@ -69,7 +69,7 @@ impl LearningMeasures {
     }
 }
 
-/// What an evaluation had cost until then, if it is known.
+/// Returns the cost of a run until an evaluation, if it is known.
 pub(crate) type CostOf = fn(&MetricsRow) -> Option<f64>;
 
 /// Returns the first evaluation in which `quantity` is at least `value`.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use tandem_core::Task;
+use tandem_core::{Task, Wilson};
 
 use crate::comparison::{Baseline, Comparison, Section};
 use crate::curve::{Axis, CurveOptions, CurvePoint, Drawing, Series, curve_drawing};
@@ -154,7 +154,7 @@ fn file_stem(slug: &str) -> String {
     slug.to_lowercase().replace(' ', "-")
 }
 
-/// Returns whether `stem` is the name of a plot's file without its extension, of this comparison or of another.
+/// Returns true if `stem` is the name of a plot's file without its extension, of this comparison or of another.
 pub(crate) fn is_file_stem(stem: &str) -> bool {
     let is_panel = |slug: &str| {
         let n_others = slug.strip_prefix("others-").map(str::parse::<usize>);
@@ -173,14 +173,12 @@ pub(crate) fn is_file_stem(stem: &str) -> bool {
 /// Returns the line of a policy that does not learn, with the interval of its evaluation on test goals, if `quantity`
 /// is a success.
 fn level(Baseline { label, test }: &Baseline, quantity: Quantity, x_max: f64) -> Option<Series> {
-    let (success, interval) = match quantity {
+    let (success, Wilson { low, high }) = match quantity {
         Quantity::Success => (test.success, test.interval),
-        Quantity::SuccessWithoutContact => {
-            test.contacts.success().map(|[success, low, high]| (success, (low, high)))?
-        }
+        Quantity::SuccessWithoutContact => test.contacts.success()?,
         _ => return None,
     };
-    let point = |x| CurvePoint { x, y: success, band: Some(interval) };
+    let point = |x| CurvePoint { x, y: success, band: Some((low, high)) };
     Some(Series { name: label.clone(), points: vec![point(0.0), point(x_max)] })
 }
 
@@ -240,7 +238,7 @@ mod tests {
     use tandem_telemetry::{ContactMetrics, MetricsRow};
 
     use crate::group::group_by_settings;
-    use crate::run::Run;
+    use crate::run::{Configuration, Run};
     use crate::test_evaluation::TestEvaluation;
 
     pub(super) fn run(strategy: &str, seed: u64, name: &str, curve: &[(u64, f64, f64)]) -> Run {
@@ -254,11 +252,22 @@ mod tests {
         Run {
             name: format!("push-{name}-seed{seed}"),
             rows: curve.iter().map(row).collect(),
-            configuration: Some(format!(
+            configuration: format!(
                 "task = \"push\"\narms = 2\nseed = {seed}\ncopy = \"{name}\"\n[advice]\nstrategy = \"{strategy}\""
-            )),
+            )
+            .parse()
+            .ok(),
             ..Run::default()
         }
+    }
+
+    /// Replaces text in a configuration.
+    fn replaced(
+        configuration: Option<Configuration>,
+        from: &str,
+        to: &str,
+    ) -> Option<Configuration> {
+        configuration?.text().replace(from, to).parse().ok()
     }
 
     pub(super) fn plain(strategy: &str) -> Run {
@@ -330,7 +339,7 @@ mod tests {
     #[test]
     fn a_task_that_the_paper_lacks_has_none_of_its_figures_and_values() {
         let mut bar = plain("mc-q:0.1");
-        bar.configuration = bar.configuration.map(|text| text.replace("\"push\"", "\"carry-bar\""));
+        bar.configuration = replaced(bar.configuration, "\"push\"", "\"carry-bar\"");
         let comparison = Comparison::of(vec![bar], Vec::new());
         assert!(comparison.sections[0].groups[0].paper().is_none());
         let plots = comparison_plots(&comparison).unwrap();
@@ -346,7 +355,7 @@ mod tests {
             n_arms: 2,
             n_episodes: 240,
             success: 0.95,
-            interval: (0.94, 0.96),
+            interval: Wilson { low: 0.94, high: 0.96 },
             success_joint: 0.9,
             collision_rate: Some(0.2),
             contacts: ContactMetrics::default(),
@@ -371,8 +380,7 @@ mod tests {
     #[test]
     fn one_and_two_arms_from_scratch_share_a_plot() {
         let mut one_arm = plain("none");
-        one_arm.configuration =
-            one_arm.configuration.map(|text| text.replace("arms = 2", "arms = 1"));
+        one_arm.configuration = replaced(one_arm.configuration, "arms = 2", "arms = 1");
         let comparison = Comparison::of(vec![plain("none"), one_arm], Vec::new());
         let drawn = from_scratch(&comparison).unwrap();
         assert_eq!(drawn.len(), 1);

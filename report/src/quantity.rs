@@ -1,5 +1,6 @@
 //! The metrics of an evaluation that reports show and compare.
 
+use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
 /// The metric that a curve shows.
@@ -40,7 +41,7 @@ impl Quantity {
         }
     }
 
-    /// Returns whether the values are shares, in [0, 1].
+    /// Returns true if the values are shares, in [0, 1].
     #[must_use]
     pub const fn is_share(self) -> bool {
         !matches!(self, Self::MeanQ | Self::AdviceSpent)
@@ -68,7 +69,7 @@ impl Quantity {
         match self {
             Self::Success => Some((row.success_low, row.success_high)),
             Self::SuccessWithoutContact => {
-                row.contacts.success().map(|[_success, low, high]| (low, high))
+                row.contacts.success().map(|(_, Wilson { low, high })| (low, high))
             }
             _ => None,
         }

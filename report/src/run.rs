@@ -1,6 +1,7 @@
 //! A run as reports see it: its metrics and, from a run directory, its configuration and final evaluation.
 
 use std::path::Path;
+use std::str::FromStr;
 
 use sha2::{Digest as _, Sha256};
 use tandem_core::task::TaskDescription;
@@ -12,7 +13,30 @@ use toml::{Table, Value};
 use crate::error::Error;
 use crate::files::{read_if_present, read_rows};
 use crate::run_summary::{self, RunLength};
-use crate::test_evaluation::TestEvaluation;
+use crate::test_evaluation::{RunSummary, TestEvaluation};
+
+/// The settings of a run, from the text of its `run.toml`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Configuration {
+    text: String,
+    settings: Table,
+}
+
+impl FromStr for Configuration {
+    type Err = toml::de::Error;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Ok(Self { text: text.to_owned(), settings: text.parse()? })
+    }
+}
+
+impl Configuration {
+    /// Returns the text of the file.
+    #[must_use]
+    pub fn text(&self) -> &str {
+        &self.text
+    }
+}
 
 /// A run as reports see it.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -21,10 +45,13 @@ pub struct Run {
     pub name: String,
     /// One row per evaluation, in order.
     pub rows: Vec<MetricsRow>,
-    /// Text of the resolved configuration `run.toml`, if there is one.
-    pub configuration: Option<String>,
+    /// The resolved configuration `run.toml`, if there is one and it can be parsed.
+    pub configuration: Option<Configuration>,
     /// Evaluation of the best policy on test goals, from `summary.json`, if there is one.
     pub test: Option<TestEvaluation>,
+    /// Digest of the learner's state at the end, from `summary.json`, if there is one. Runs with equal settings and equal
+    /// digests are the same run.
+    pub digest: Option<String>,
     /// SHA-256 of the teacher's file in the run directory, the first digits, hexadecimal, if there is one.
     pub teacher: Option<String>,
 }
@@ -32,27 +59,29 @@ pub struct Run {
 impl Run {
     /// Reads the run directory `dir`.
     ///
-    /// Metrics are read up to the first invalid line. That and an unusable `summary.json` add to `warnings`.
+    /// Metrics are read up to the first invalid line. That, an unusable `summary.json` and a `run.toml` that is no TOML
+    /// add to `warnings`.
     ///
     /// # Errors
     /// If `metrics.jsonl` or `run.toml` cannot be read.
     pub fn load(dir: &Path, warnings: &mut Vec<String>) -> Result<Self, Error> {
         let rows = read_metrics(&dir.join("metrics.jsonl"), warnings)?;
-        let configuration = read_if_present(&dir.join("run.toml"))?;
+        let configuration = read_configuration(&dir.join("run.toml"), warnings)?;
         let teacher = teacher_of(dir);
         let mut run =
             Self { name: directory_name(dir), rows, configuration, teacher, ..Self::default() };
         let summary = dir.join(run_summary::FILE);
         if summary.exists() {
-            match TestEvaluation::load_summary(&summary, run.length()) {
-                Ok(test) => run.test = test,
+            match RunSummary::load(&summary, run.length()) {
+                Ok(Some(RunSummary { digest, test })) => (run.digest, run.test) = (digest, test),
+                Ok(None) => {}
                 Err(error) => warnings.push(error.to_string()),
             }
         }
         Ok(run)
     }
 
-    /// Returns whether the run has taken advice.
+    /// Returns true if the run has taken advice.
     pub(crate) fn took_advice(&self) -> bool {
         self.rows.iter().any(|row| row.advice_spent > 0)
     }
@@ -85,22 +114,26 @@ impl Run {
         self.rows.last()
     }
 
-    /// Returns the configuration as a table, which is empty if there is none, with the digest of the teacher, which the
+    /// Returns a top-level setting or section of the configuration.
+    pub(crate) fn setting(&self, key: &str) -> Option<&Value> {
+        self.configuration.as_ref()?.settings.get(key)
+    }
+
+    /// Returns the configuration, which is empty if there is none, with the digest of the teacher, which the
     /// configuration does not name.
-    pub(crate) fn settings(&self) -> Table {
-        let settings = self.configuration.as_ref().and_then(|text| text.parse::<Table>().ok());
-        let mut settings = settings.unwrap_or_default();
+    pub(crate) fn settings_with_teacher(&self) -> Table {
+        let settings = self.configuration.as_ref().map(|configuration| &configuration.settings);
+        let mut settings = settings.cloned().unwrap_or_default();
         if let Some(teacher) = self.teacher.as_ref().filter(|_| !settings.is_empty()) {
             settings.insert("teacher".to_owned(), Value::String(teacher.clone()));
         }
         settings
     }
 
-    /// Returns how far the run is, from its configuration and its last evaluation.
+    /// Returns the length of the run, from its configuration and its last evaluation.
     fn length(&self) -> RunLength {
         let max_env_steps = || {
-            let settings = self.settings();
-            let max_env_steps = settings.get("stop")?.get("max_env_steps")?.as_integer()?;
+            let max_env_steps = self.setting("stop")?.get("max_env_steps")?.as_integer()?;
             u64::try_from(max_env_steps).ok()
         };
         let env_steps = self.last().map(|last| last.env_steps);
@@ -111,7 +144,7 @@ impl Run {
     #[must_use]
     pub fn task(&self) -> Option<String> {
         let in_name = |task: &Task| self.name.contains(task.name());
-        match self.settings().get("task").and_then(Value::as_str) {
+        match self.setting("task").and_then(Value::as_str) {
             Some(name) => Some(name.to_owned()),
             // Last first: `push` is contained in `shared-push`.
             None => Task::ALL.into_iter().rev().find(in_name).map(|task| task.name().to_owned()),
@@ -121,17 +154,16 @@ impl Run {
     /// Returns the task, from the configuration; `None` if there is none or its task is invalid.
     #[must_use]
     pub fn task_spec(&self) -> Option<TaskSpec> {
-        let settings = self.settings();
-        if let Some(description) = settings.get("description") {
+        if let Some(description) = self.setting("description") {
             let description: TaskDescription = description.clone().try_into().ok()?;
             return TaskSpec::new(description).ok();
         }
-        let task = settings.get("task")?.as_str()?.parse().ok()?;
-        let n_arms = usize::try_from(settings.get("arms")?.as_integer()?).ok()?;
+        let task = self.setting("task")?.as_str()?.parse().ok()?;
+        let n_arms = usize::try_from(self.setting("arms")?.as_integer()?).ok()?;
         TaskSpec::new(Layout::new(task, n_arms).description()).ok()
     }
 
-    /// Returns whether the task reports contacts; true if the task is unknown.
+    /// Returns true if the task reports contacts or is unknown.
     #[must_use]
     pub fn reports_contacts(&self) -> bool {
         self.task_spec().is_none_or(|task| task.reports_contacts())
@@ -140,7 +172,7 @@ impl Run {
     /// Returns the seed, from the configuration or else from the name's suffix `-seedN`.
     #[must_use]
     pub fn seed(&self) -> Option<u64> {
-        match self.settings().get("seed").and_then(Value::as_integer) {
+        match self.setting("seed").and_then(Value::as_integer) {
             Some(seed) => u64::try_from(seed).ok(),
             None => self.name.rsplit_once("-seed")?.1.parse().ok(),
         }
@@ -167,6 +199,22 @@ fn read_metrics(path: &Path, warnings: &mut Vec<String>) -> Result<Vec<MetricsRo
     Ok(rows)
 }
 
+/// Reads a `run.toml`. One that is no TOML adds a warning.
+fn read_configuration(
+    path: &Path,
+    warnings: &mut Vec<String>,
+) -> Result<Option<Configuration>, Error> {
+    let Some(text) = read_if_present(path)? else { return Ok(None) };
+    let configuration = text.parse().map_err(|error: toml::de::Error| {
+        let problem = error.message().replace('\n', " ");
+        warnings.push(format!(
+            "{} is not TOML ({problem}): the settings of this run are unknown",
+            path.display()
+        ));
+    });
+    Ok(configuration.ok())
+}
+
 fn directory_name(dir: &Path) -> String {
     let absolute = dir.canonicalize().unwrap_or_else(|_| dir.to_owned());
     absolute.file_name().unwrap_or(dir.as_os_str()).to_string_lossy().into_owned()
@@ -187,7 +235,7 @@ mod tests {
     fn task_and_seed_come_from_the_configuration_before_the_name() {
         let run = |name: &str, configuration: Option<&str>| Run {
             name: name.to_owned(),
-            configuration: configuration.map(str::to_owned),
+            configuration: configuration.and_then(|text| text.parse().ok()),
             ..Run::default()
         };
         let named = run("teacher-pick-and-place-seed12", None);

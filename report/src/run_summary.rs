@@ -5,7 +5,7 @@ use serde_json::Value;
 /// Name of the file in the run directory.
 pub const FILE: &str = "summary.json";
 
-/// How far a run is, as far as this is known.
+/// The progress of a run, where known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RunLength {
     /// Number of environment steps after which the run ends, from its configuration; 0 for a run that ends otherwise.
@@ -14,7 +14,7 @@ pub struct RunLength {
     pub env_steps: Option<u64>,
 }
 
-/// Returns whether `summary` is that of the run as it is now.
+/// Returns true if `summary` is that of the run as it is now.
 ///
 /// A learner that extends a run without `tandem train`, and an extension that is interrupted at once, leave the summary
 /// of the shorter run. A summary of an earlier version that lacks its length counts as current.

@@ -3,13 +3,13 @@
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::group::Spread;
+use crate::spread::Spread;
 
 /// Shown for a value that does not exist.
 pub(crate) const NONE: &str = "–";
 
-/// Width of a terminal for which tables are formatted, columns.
-pub(crate) const TERMINAL_COLUMNS: usize = 80;
+/// Width of the narrowest terminal for which output is laid out, columns.
+pub const TERMINAL_COLUMNS: usize = 80;
 /// Gap between two columns.
 const GAP: usize = 2;
 /// Smallest width of the first column of an aligned table.
@@ -73,7 +73,7 @@ impl Table {
         let widths: Vec<usize> =
             (0..self.header.len()).map(|column| width(column).unwrap_or(0)).collect();
         let others: usize = widths.iter().skip(1).map(|width| GAP + width).sum();
-        let title = wrapped(&self.title);
+        let title = paragraph(&self.title);
         if others + MIN_FIRST_COLUMN > TERMINAL_COLUMNS {
             return format!("{title}{}", self.blocks());
         }
@@ -103,7 +103,7 @@ impl Table {
         let block = |row: &Vec<String>| {
             let cells = names.clone().zip(row.iter().skip(1));
             let lines = cells.map(|(name, cell)| format!("  {name:<width$}  {cell}\n"));
-            let label = wrapped(row.first().map_or("", String::as_str));
+            let label = paragraph(row.first().map_or("", String::as_str));
             format!("{label}{}", lines.collect::<String>())
         };
         self.rows.iter().map(block).collect()
@@ -117,25 +117,33 @@ fn aligned(row: &[String], first: usize, widths: &[usize]) -> String {
     let others: String =
         others.map(|(cell, width)| format!("{:gap$}{cell:>width$}", "", gap = GAP)).collect();
     let line = match n_chars(label) > first {
-        true => format!("{}{:first$}{others}", wrapped(label), ""),
+        true => format!("{}{:first$}{others}", paragraph(label), ""),
         false => format!("{label:<first$}{others}"),
     };
     format!("{}\n", line.trim_end())
 }
 
-/// Breaks a line of text at spaces so that it fits into [`TERMINAL_COLUMNS`].
-pub(crate) fn wrapped(text: &str) -> String {
+/// Breaks `text` between words into lines of at most [`TERMINAL_COLUMNS`] columns. Lines after the first start with
+/// `indent`. A word that is longer than a line, such as a path, gets a line of its own.
+#[must_use]
+pub fn wrapped(text: &str, indent: &str) -> String {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
         match lines.last_mut() {
+            None => lines.push(word.to_owned()),
             Some(line) if n_chars(line) + 1 + n_chars(word) <= TERMINAL_COLUMNS => {
                 line.push(' ');
                 line.push_str(word);
             }
-            _ => lines.push(word.to_owned()),
+            Some(_) => lines.push(format!("{indent}{word}")),
         }
     }
-    lines.into_iter().map(|line| line + "\n").collect()
+    lines.join("\n")
+}
+
+/// Returns `text` in lines of at most [`TERMINAL_COLUMNS`] columns, each with its end.
+pub(crate) fn paragraph(text: &str) -> String {
+    wrapped(text, "").lines().map(|line| format!("{line}\n")).collect()
 }
 
 fn n_chars(text: &str) -> usize {
@@ -191,11 +199,17 @@ pub(crate) fn number(value: f64) -> String {
 
 /// Formats the 95 % interval of an evaluation's success in per cent.
 pub(crate) fn interval(row: &MetricsRow) -> String {
-    format!("{:.1}–{:.1} %", 100.0 * row.success_low, 100.0 * row.success_high)
+    percent_range(Wilson { low: row.success_low, high: row.success_high })
+}
+
+/// Formats an interval in per cent.
+pub(crate) fn percent_range(Wilson { low, high }: Wilson) -> String {
+    format!("{:.1}–{:.1} %", 100.0 * low, 100.0 * high)
 }
 
 /// Formats a count with thousands separators.
-pub(crate) fn thousands(count: u64) -> String {
+#[must_use]
+pub fn thousands(count: u64) -> String {
     let digits = count.to_string();
     let mut text = String::with_capacity(digits.len() + digits.len() / 3);
     for (i, digit) in digits.chars().enumerate() {
@@ -232,6 +246,18 @@ pub(crate) fn duration(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lines_break_between_words_only() {
+        let path = "x".repeat(100);
+        let text = format!("{} {path} end", "word ".repeat(20));
+        let lines = wrapped(&text, "  ");
+        let lines: Vec<&str> = lines.lines().collect();
+        assert_eq!((lines.len(), lines[0].len()), (4, 79), "{lines:?}");
+        assert_eq!(lines[1..], ["  word word word word", &format!("  {path}"), "  end"]);
+        assert_eq!((wrapped("", "  ").as_str(), paragraph("").as_str()), ("", ""));
+        assert_eq!(paragraph("a  b"), "a b\n");
+    }
 
     #[test]
     fn counts_and_durations_are_formatted_for_people() {

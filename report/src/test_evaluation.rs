@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use serde_json::Value;
+use tandem_core::Wilson;
 use tandem_telemetry::ContactMetrics;
 
 use crate::error::Error;
@@ -20,50 +21,38 @@ pub struct TestEvaluation {
     pub n_episodes: u64,
     /// Success rate: share of episodes with every object at its goal, in [0, 1].
     pub success: f64,
-    /// Lower and upper bound of the 95 % interval of `success`.
-    pub interval: (f64, f64),
+    /// The 95 % interval of `success`.
+    pub interval: Wilson,
     /// Share of episodes with the joint norm within the tolerance, in [0, 1].
     pub success_joint: f64,
     /// Share of episodes with at least one contact between the arms, or between an arm and the table. `None` for a task
     /// that reports no contacts.
     pub collision_rate: Option<f64>,
-    /// Measures that tell contacts apart, as far as they are known.
+    /// Measures that distinguish contacts between arms from contacts with the table, where known.
     pub contacts: ContactMetrics,
 }
 
 impl TestEvaluation {
-    /// Reads the JSON object on the last line of `path`.
+    /// Reads the JSON object on the last line of `path`: the evaluation of a policy, and those of its baselines with their
+    /// names.
     ///
     /// # Errors
     /// If the file cannot be read, or its last line is not the result of an evaluation.
-    pub fn load(path: &Path) -> Result<Self, Error> {
+    pub fn load(path: &Path) -> Result<(Self, Vec<(String, Self)>), Error> {
         let text = read_text(path).map_err(read_error(path))?;
         Self::parse(&text)
             .map_err(|problem| Error::InvalidEvaluation { path: path.to_owned(), problem })
     }
 
-    /// Reads the summary of a run that is as far as `run`.
-    ///
-    /// Returns `None` for a run without test goals, whose summary has no success, and for a summary that is not
-    /// [current](run_summary::is_current).
-    ///
-    /// # Errors
-    /// If the file cannot be read, or its last line is not a summary.
-    pub fn load_summary(path: &Path, run: RunLength) -> Result<Option<Self>, Error> {
-        let text = read_text(path).map_err(read_error(path))?;
-        let problem = |problem| Error::InvalidEvaluation { path: path.to_owned(), problem };
-        let object = last_object(&text).map_err(problem)?;
-        let is_summary = object.get("digest").is_some();
-        let is_old = !run_summary::is_current(&object, run);
-        if is_summary && (is_old || object.get("success").is_none()) {
-            return Ok(None);
-        }
-        Self::of(&object).map(Some).map_err(problem)
-    }
-
     /// Parses the JSON object on the last line of `text`. The error names the field.
-    fn parse(text: &str) -> Result<Self, String> {
-        Self::of(&last_object(text)?)
+    fn parse(text: &str) -> Result<(Self, Vec<(String, Self)>), String> {
+        let object = last_object(text)?;
+        let baselines = object.get("baselines").and_then(Value::as_array);
+        let baselines = baselines.into_iter().flatten().map(|baseline| {
+            let name = baseline["name"].as_str().ok_or("a baseline has no \"name\"")?;
+            Ok((name.to_owned(), Self::of(baseline)?))
+        });
+        Ok((Self::of(&object)?, baselines.collect::<Result<_, String>>()?))
     }
 
     fn of(object: &Value) -> Result<Self, String> {
@@ -79,7 +68,7 @@ impl TestEvaluation {
             n_arms: usize::try_from(count("arms")?).map_err(|error| error.to_string())?,
             n_episodes: count("episodes")?,
             success: number("success")?,
-            interval: (number("success_low")?, number("success_high")?),
+            interval: Wilson { low: number("success_low")?, high: number("success_high")? },
             success_joint: number("success_joint")?,
             collision_rate: match object.get("collision_rate") {
                 // Of a task that reports no contacts.
@@ -89,6 +78,36 @@ impl TestEvaluation {
             contacts: serde_json::from_value(object.clone())
                 .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
         })
+    }
+}
+
+/// The parts of a run's `summary.json` that reports use.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct RunSummary {
+    /// Digest of the learner's state at the end. `None` in a summary of another program than `tandem train`.
+    pub(crate) digest: Option<String>,
+    /// The test of the best policy. `None` for a run without test goals, whose summary has no success.
+    pub(crate) test: Option<TestEvaluation>,
+}
+
+impl RunSummary {
+    /// Reads the summary of a run that is as far as `run`; `None` if it is not [current](run_summary::is_current).
+    ///
+    /// # Errors
+    /// If the file cannot be read, or its last line is not a summary.
+    pub(crate) fn load(path: &Path, run: RunLength) -> Result<Option<Self>, Error> {
+        let text = read_text(path).map_err(read_error(path))?;
+        let problem = |problem| Error::InvalidSummary { path: path.to_owned(), problem };
+        let object = last_object(&text).map_err(problem)?;
+        let digest = object.get("digest").and_then(Value::as_str).map(str::to_owned);
+        if digest.is_some() && !run_summary::is_current(&object, run) {
+            return Ok(None);
+        }
+        if digest.is_some() && object.get("success").is_none() {
+            return Ok(Some(Self { digest, test: None }));
+        }
+        let test = TestEvaluation::of(&object).map_err(problem)?;
+        Ok(Some(Self { digest, test: Some(test) }))
     }
 }
 
@@ -109,9 +128,9 @@ mod tests {
     #[test]
     fn the_last_line_is_read() {
         let test =
-            TestEvaluation::parse(&format!("chatter\n{}\n", LINE.replace('\n', ""))).unwrap();
+            TestEvaluation::parse(&format!("chatter\n{}\n", LINE.replace('\n', ""))).unwrap().0;
         assert_eq!((test.task.as_str(), test.n_arms, test.n_episodes), ("push", 2, 240));
-        assert_eq!((test.success, test.interval), (0.958, (0.925, 0.977)));
+        assert_eq!((test.success, test.interval), (0.958, Wilson { low: 0.925, high: 0.977 }));
         assert_eq!((test.success_joint, test.collision_rate), (0.9, Some(0.175)));
         assert_eq!(test.contacts, ContactMetrics::default(), "of an earlier version");
     }
@@ -121,12 +140,25 @@ mod tests {
         let more = r#""success_without_contact":0.75,"success_without_contact_low":0.7,
             "success_without_contact_high":0.8,"avoidance_rate":0.5,"collision_rate""#;
         let line = LINE.replace(r#""collision_rate""#, more).replace('\n', "");
-        let test = TestEvaluation::parse(&line).unwrap();
-        assert_eq!(test.contacts.success(), Some([0.75, 0.7, 0.8]));
+        let test = TestEvaluation::parse(&line).unwrap().0;
+        let interval = Wilson { low: 0.7, high: 0.8 };
+        assert_eq!(test.contacts.success(), Some((0.75, interval)));
         assert_eq!(
             (test.contacts.avoidance_rate, test.contacts.arm_contact_rate),
             (Some(0.5), None)
         );
+    }
+
+    #[test]
+    fn baselines_are_read_with_their_names() {
+        let line = LINE.replace('\n', "");
+        let baseline = line.replacen('{', r#"{"name":"blind policy","#, 1).replace("0.958", "0.9");
+        let both = line.replacen('{', &format!(r#"{{"baselines":[{baseline}],"#), 1);
+        let (policy, baselines) = TestEvaluation::parse(&both).unwrap();
+        let [(name, blind)] = &baselines[..] else { panic!("{baselines:?}") };
+        assert_eq!((policy.success, name.as_str(), blind.success), (0.958, "blind policy", 0.9));
+        let nameless = both.replace(r#""name":"blind policy","#, "");
+        assert!(TestEvaluation::parse(&nameless).unwrap_err().contains("name"));
     }
 
     #[test]
@@ -146,14 +178,18 @@ mod tests {
         let path = dir.path().join("summary.json");
         let load = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            TestEvaluation::load_summary(&path, RunLength::default())
+            RunSummary::load(&path, RunLength::default())
         };
         let served = r#"{"task":"lab/reach","arms":2,"env_steps":2400,"digest":"5f3a"}"#;
-        assert_eq!(load(served).unwrap(), None);
+        let untested = RunSummary { digest: Some("5f3a".to_owned()), test: None };
+        assert_eq!(load(served).unwrap(), Some(untested));
         assert!(load(r#"{"task":"lab/reach","arms":2}"#).is_err(), "not a summary");
         assert!(load(r#"{"task":"push","success":"high","digest":"5f3a"}"#).is_err());
-        let tested = load(&LINE.replace('\n', "")).unwrap();
-        assert_eq!(tested.map(|test| test.task), Some("push".to_owned()));
+        let damaged = load(r#"{"task":"push","succ"#).unwrap_err().to_string();
+        assert!(damaged.contains("is not the summary of a run"), "{damaged}");
+        let tested = load(&LINE.replace('\n', "")).unwrap().unwrap();
+        assert_eq!(tested.test.map(|test| test.task), Some("push".to_owned()));
+        assert_eq!(tested.digest, None);
     }
 
     #[test]
@@ -163,12 +199,12 @@ mod tests {
         let of_2400 = r#""digest":"5f3a","max_env_steps":2400,"collision_rate""#;
         std::fs::write(&path, LINE.replace('\n', "").replace(r#""collision_rate""#, of_2400))
             .unwrap();
-        let has_test = |max_env_steps| {
+        let is_current = |max_env_steps| {
             let run = RunLength { max_env_steps, env_steps: None };
-            TestEvaluation::load_summary(&path, run).unwrap().is_some()
+            RunSummary::load(&path, run).unwrap().is_some()
         };
-        assert!(has_test(Some(2400)) && has_test(None));
-        assert!(!has_test(Some(4800)));
+        assert!(is_current(Some(2400)) && is_current(None));
+        assert!(!is_current(Some(4800)));
     }
 
     #[test]

@@ -53,7 +53,7 @@ pub struct Trials {
     pub warnings: Vec<String>,
 }
 
-/// Which trials a report plots.
+/// The trials that a report plots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PlottedTrials {
     /// Failed trials.
@@ -156,7 +156,7 @@ impl TrialGroup {
     }
 }
 
-/// Returns whether a trial succeeded. A trial with a cause is a failure, whatever its other fields are.
+/// Returns true if a trial succeeded. A trial with a cause is a failure, whatever its other fields are.
 fn succeeded(row: &TrialRow) -> bool {
     row.success && row.cause.is_none()
 }
@@ -201,7 +201,7 @@ fn plot(row: &TrialRow, names: &mut BTreeMap<String, u32>) -> Plot {
     Plot { file_name, title, svg: wide, narrow_svg: narrow }
 }
 
-/// Returns whether `stem` is the name of a plot's file without its extension, of these trials or of others.
+/// Returns true if `stem` is the name of a plot's file without its extension, of these trials or of others.
 pub(crate) fn is_file_stem(stem: &str) -> bool {
     let numbers = stem.strip_prefix("trial-").and_then(|rest| rest.rsplit_once("-seed"));
     let Some((_, numbers)) = numbers else { return false };

@@ -38,7 +38,7 @@ fn row(round: u32, n_hits: u8) -> MetricsRow {
 
 fn run_dir(rows: &[MetricsRow]) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
-    let mut log = MetricsLog::open(&dir.path().join("metrics.jsonl")).unwrap();
+    let (mut log, _) = MetricsLog::restore(&dir.path().join("metrics.jsonl"), &[]).unwrap();
     rows.iter().for_each(|row| log.append(row).unwrap());
     dir
 }
@@ -172,7 +172,7 @@ fn seed_of(parent: &Path, strategy: &str, seed: u64, rows: &[MetricsRow]) {
     let settings =
         format!("task = \"push\"\narms = 2\nseed = {seed}\n[advice]\nstrategy = \"{strategy}\"\n");
     std::fs::write(dir.join("run.toml"), settings).unwrap();
-    let mut log = MetricsLog::open(&dir.join("metrics.jsonl")).unwrap();
+    let (mut log, _) = MetricsLog::restore(&dir.join("metrics.jsonl"), &[]).unwrap();
     rows.iter().for_each(|row| log.append(row).unwrap());
 }
 
@@ -286,7 +286,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     let described = dir.path().join("lab-reach-2-ea-seed1");
     std::fs::create_dir(&described).unwrap();
     std::fs::write(described.join("run.toml"), DESCRIBED).unwrap();
-    let mut log = MetricsLog::open(&described.join("metrics.jsonl")).unwrap();
+    let (mut log, _) = MetricsLog::restore(&described.join("metrics.jsonl"), &[]).unwrap();
     [row(0, 0), row(5, 216)].iter().for_each(|row| log.append(row).unwrap());
 
     let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
@@ -298,7 +298,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
             n_arms: 2,
             n_episodes: 240,
             success: 0.75,
-            interval: (0.69, 0.8),
+            interval: tandem_core::Wilson { low: 0.69, high: 0.8 },
             success_joint: 0.7,
             collision_rate: None,
             contacts: ContactMetrics::default(),

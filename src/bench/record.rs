@@ -1,4 +1,4 @@
-//! What the recording of every episode costs a run.
+//! The cost of recording every episode of a run.
 
 use std::path::Path;
 

@@ -88,7 +88,7 @@ impl Model {
         let clock = clock::BridgeClock::new();
         let mut at_s = clock.now_s();
         while !interrupted.is_cancelled() {
-            // After a pause of the whole machine, time goes on from there.
+            // After a pause of the whole machine, simulated time continues from there.
             at_s = (at_s + PERIOD_S).max(clock.now_s() - 10.0 * PERIOD_S);
             clock.sleep_until(at_s);
             self.accept()?;

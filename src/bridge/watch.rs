@@ -1,4 +1,4 @@
-//! The displays and logs of the arms of a bridge: logs of motions, viewers and the operator page.
+//! Displays and recordings of the arms of a bridge: logs of motions, viewers and the operator page.
 //!
 //! The arms' thread puts every state into a bounded queue and waits for nothing. One thread turns states into views and
 //! offers them to viewers and pages; another one writes logs, so that a slow disk delays neither.

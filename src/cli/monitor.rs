@@ -45,7 +45,8 @@ Examples:
   tandem status learner:7000 --token-file token --json
 
 Exit codes: 0 success (with --watch, the run has ended), 64 wrong token, directory or address, 75 the learner cannot be \
-reached, or none is running and the run is not complete.")]
+reached, or none is running and the run is not complete; with --watch also, the run was interrupted or its learner has \
+failed. A run directory is followed across restarts of its learner.")]
 pub(crate) struct StatusArgs {
     /// Run directory of a `tandem train` on this machine, directory that holds runs, or address of a learner or relay.
     #[arg(value_name = "DIR|ADDR")]

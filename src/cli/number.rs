@@ -1,10 +1,19 @@
 //! Numbers on the command line.
 
+/// The largest integer of a run file: that of TOML.
+const MAX: u64 = i64::MAX.cast_unsigned();
+
 /// Parses a whole number, also with `_` between its digits or with an exponent: 100000, `100_000`, 1e5 or 1.5e6.
 pub(super) fn whole(text: &str) -> Result<u64, String> {
-    parse(text).ok_or_else(|| {
-        "expected a whole number below 2^64, such as 100000, 100_000 or 1e5".to_owned()
+    parse(text).filter(|number| *number <= MAX).ok_or_else(|| {
+        "expected a whole number below 2^63, such as 100000, 100_000 or 1e5".to_owned()
     })
+}
+
+/// Parses a seed of a run.
+pub(super) fn seed(text: &str) -> Result<u64, String> {
+    let seed = text.parse().ok().filter(|seed| *seed <= MAX);
+    seed.ok_or_else(|| "expected a whole number below 2^63".to_owned())
 }
 
 fn parse(text: &str) -> Option<u64> {
@@ -34,16 +43,20 @@ mod tests {
             ("1.5E6", 1_500_000),
             ("1.50e1", 15),
             ("1.0", 1),
-            ("18446744073709551615", u64::MAX),
+            ("9223372036854775807", MAX),
         ] {
             assert_eq!(whole(text), Ok(number), "{text}");
         }
         let not_whole =
             ["", "-1", "+1", "1.5", "1.", ".5", "1e-3", "1e", "1e+3", "nan", "1,000", "0x10"];
         let underscores = ["_1", "1_", "1__0", "1_e5"];
-        let too_large = ["1e20", "1e99", "18446744073709551616"];
+        let too_large = ["1e19", "1e20", "1e99", "9223372036854775808", "18446744073709551616"];
         for text in not_whole.iter().chain(&underscores).chain(&too_large) {
             assert!(whole(text).is_err(), "{text}");
+        }
+        assert_eq!(seed("9223372036854775807"), Ok(MAX));
+        for text in ["9223372036854775808", "1e5", "-1"] {
+            assert!(seed(text).is_err(), "{text}");
         }
     }
 }

@@ -7,6 +7,11 @@ use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
 
+/// Default size limit of the recorded episodes.
+const DEFAULT_LOG_BUDGET: ByteSize = ByteSize(2 << 30);
+/// Default address of the live view.
+const DEFAULT_LIVE: &str = "127.0.0.1:8765";
+
 /// Recording of episodes.
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct RecordingArgs {
@@ -16,7 +21,7 @@ pub(crate) struct RecordingArgs {
     pub(crate) record: RecordedName,
     /// Size that the recorded episodes may reach, for example 500MB or 10GiB. Beyond it, the oldest ones are deleted,
     /// training episodes first.
-    #[arg(long, value_name = "SIZE", default_value_t = ByteSize(2 << 30))]
+    #[arg(long, value_name = "SIZE", default_value_t = DEFAULT_LOG_BUDGET)]
     pub(crate) log_budget: ByteSize,
 }
 
@@ -29,6 +34,19 @@ impl RecordingArgs {
             .map_or_else(String::new, |value| value.get_name().to_owned());
         ["--record".into(), name.into(), "--log-budget".into(), self.log_budget.to_string().into()]
     }
+
+    /// Returns the options that differ from their defaults, each after a space, for a command line that is printed.
+    pub(crate) fn shell_words(self) -> String {
+        let record = match self.record {
+            RecordedName::None => " --record none",
+            RecordedName::Evaluation => "",
+            RecordedName::All => " --record all",
+        };
+        match self.log_budget {
+            DEFAULT_LOG_BUDGET => record.to_owned(),
+            budget => format!("{record} --log-budget {budget}"),
+        }
+    }
 }
 
 /// Live view in Foxglove.
@@ -36,8 +54,19 @@ impl RecordingArgs {
 pub(crate) struct LiveArgs {
     /// Shows the episodes in Foxglove, over a websocket at this address [with no address: 127.0.0.1:8765]. Anyone who
     /// can reach the address can watch.
-    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = "127.0.0.1:8765")]
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = DEFAULT_LIVE)]
     pub(crate) live: Option<SocketAddr>,
+}
+
+impl LiveArgs {
+    /// Returns the option, after a space, for a command line that is printed.
+    pub(crate) fn shell_words(self) -> String {
+        match self.live.map(|address| address.to_string()) {
+            None => String::new(),
+            Some(address) if address == DEFAULT_LIVE => " --live".to_owned(),
+            Some(address) => format!(" --live {address}"),
+        }
+    }
 }
 
 /// The episodes to record.

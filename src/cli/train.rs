@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::number::whole;
+use super::number::{seed, whole};
 use super::{EnvironmentArgs, LiveArgs, MetricsArgs, RecordingArgs, TaskName, WorldName};
+use crate::shell::shell_word;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum RecipeName {
@@ -87,7 +88,7 @@ pub(crate) struct TrainArgs {
     #[command(flatten, next_help_heading = "Environments of another process")]
     pub(crate) environment: EnvironmentArgs,
     /// Seed of all random numbers [default: 1].
-    #[arg(long, help_heading = SETTINGS, value_name = "N")]
+    #[arg(long, help_heading = SETTINGS, value_name = "N", value_parser = seed)]
     pub(crate) seed: Option<u64>,
     /// Stops when an evaluation reaches this success rate, 0 to 1; contacts do not count against it.
     #[arg(long, help_heading = END_OF_THE_RUN, value_name = "P")]
@@ -196,6 +197,17 @@ pub(crate) struct DashboardArgs {
     /// Serves no dashboard.
     #[arg(long, conflicts_with = "dashboard")]
     pub(crate) no_dashboard: bool,
+}
+
+impl DashboardArgs {
+    /// Returns the options, each after a space, for a command line that is printed.
+    pub(crate) fn shell_words(&self) -> String {
+        let address = self.dashboard.map(|address| format!(" --dashboard {address}"));
+        let token = self.dashboard_token_file.as_deref().map(shell_word);
+        let token = token.map(|path| format!(" --dashboard-token-file {path}"));
+        let none = if self.no_dashboard { " --no-dashboard" } else { "" };
+        format!("{}{}{none}", address.unwrap_or_default(), token.unwrap_or_default())
+    }
 }
 
 /// Parses a UTF-8 path, which can be part of an address.

@@ -127,7 +127,7 @@ impl<'a> EpisodeFiles<'a> {
     }
 }
 
-/// Returns whether the film may show this episode.
+/// Returns true if the film may show this episode.
 fn is_shown(args: &EvalArgs, episode: &Episode) -> bool {
     match args.film_outcome {
         None => true,

@@ -34,7 +34,7 @@ impl SpanLayer {
         Self { spans }
     }
 
-    /// Returns whether a span has a trace context.
+    /// Returns true if a span has a trace context.
     pub(crate) fn wants(metadata: &Metadata<'_>) -> bool {
         metadata.is_span() && metadata.fields().field("trace_id").is_some()
     }

@@ -87,7 +87,7 @@ fn configuration_problem(error: &anyhow::Error) -> Option<&str> {
     statuses.find(|status| is_configuration(status)).map(Status::message)
 }
 
-/// Returns whether a peer requires another token or is another service.
+/// Returns true if a peer requires another token or is another service.
 fn is_configuration(status: &Status) -> bool {
     matches!(status.code(), Code::Unauthenticated | Code::Unimplemented)
 }

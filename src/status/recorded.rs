@@ -7,12 +7,12 @@ use serde_json::{Value, json};
 use tandem_learner::service::encode_evaluation;
 use tandem_proto::pb;
 use tandem_report::Run;
+use tandem_report::table::thousands;
 
 use super::lines;
 use crate::exit::{Exit, Failed, OrExit as _};
 use crate::output;
 use crate::progress_json::progress_json;
-use crate::progress_text::grouped;
 use crate::run_directory::{self, RunState};
 use crate::run_file;
 use crate::shell::shell_word;
@@ -96,7 +96,7 @@ impl Listed {
     /// Returns the latest evaluation; nothing before the first.
     fn result(&self) -> String {
         self.latest.as_ref().map_or_else(String::new, |latest| {
-            format!("{} env steps, success {:.3}", grouped(latest.env_steps), latest.success)
+            format!("{} env steps, success {:.3}", thousands(latest.env_steps), latest.success)
         })
     }
 

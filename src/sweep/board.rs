@@ -1,4 +1,4 @@
-//! What the dashboard of a sweep shows: the runs as their directories and processes report them.
+//! The content of the dashboard of a sweep: the runs as their directories and processes report them.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -5,11 +5,12 @@ use std::io::{IsTerminal as _, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{HumanCount, MultiProgress, ProgressBar};
 use serde_json::Value;
 
 use crate::launch::last_line;
 use crate::output;
+use crate::run_display::style;
 
 /// Bytes at the end of a log that are searched for its last line.
 const TAIL_BYTES: u64 = 4096;
@@ -97,12 +98,6 @@ impl Live {
         bar.enable_steady_tick(Duration::from_millis(200));
         Self { all, bar, running: Vec::new() }
     }
-}
-
-fn style(template: &str) -> ProgressStyle {
-    ProgressStyle::with_template(template)
-        .unwrap_or_else(|_| ProgressStyle::default_bar())
-        .progress_chars("=> ")
 }
 
 /// Returns the results in a summary on one line.

@@ -6,16 +6,16 @@
 
 use std::ffi::OsString;
 use std::fs::TryLockError;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::pin::pin;
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::process::ChildStdout;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::run_status::{self, RunStatus, State};
@@ -40,13 +40,15 @@ pub(super) struct RunProcess {
     args: Vec<OsString>,
 }
 
-/// How a run ended.
+/// The end of a run.
 #[derive(Debug, PartialEq)]
 pub(super) enum RunOutcome {
     /// The run is complete, with this summary on the last line of its output.
     Complete(Value),
     /// The run was asked to exit and is saved.
     Interrupted,
+    /// The run was not started: another process still uses its directory.
+    InUse,
     /// The run failed for this reason.
     Failed(String),
 }
@@ -85,13 +87,15 @@ impl RunProcess {
         &self.run.name
     }
 
-    /// Runs to the end, or until `stop` asks the run to save and exit. Messages about the progress go to `progress`.
+    /// Runs to the end, or until `stop` asks the run to save and exit. Messages about the progress go to `progress`, lines
+    /// for the user to `lines`.
     pub(super) async fn run(
         self,
         stop: CancellationToken,
         progress: watch::Sender<Value>,
+        lines: mpsc::Sender<String>,
     ) -> RunOutcome {
-        match self.try_run(&stop, &progress).await {
+        match self.try_run(&stop, &progress, &lines).await {
             Ok(outcome) => outcome,
             Err(error) => RunOutcome::Failed(format!("{error:#}")),
         }
@@ -101,13 +105,26 @@ impl RunProcess {
         &self,
         stop: &CancellationToken,
         progress: &watch::Sender<Value>,
+        lines: &mpsc::Sender<String>,
     ) -> anyhow::Result<RunOutcome> {
         let log = ProcessLog::open(&self.log_path())?;
-        let locked = retry(&self.dir, stop, || lock(&log)).await?;
-        let unused =
-            retry(&self.dir, stop, || run_lock::unused(&self.dir).map_err(Failed::into_error));
-        let (Some(()), Some(unused)) = (locked, unused.await?) else {
-            return Ok(RunOutcome::Interrupted);
+        let wait = || {
+            let (name, dir) = (self.name(), self.dir.display());
+            // A full queue has older lines for the user.
+            drop(lines.try_send(format!("{name}: waits for another process that uses {dir}")));
+        };
+        let mut is_log_locked = false;
+        let taken = retry(stop, wait, || {
+            is_log_locked = is_log_locked || lock(&log)?.is_some();
+            match is_log_locked {
+                true => run_lock::unused(&self.dir).map_err(Failed::into_error),
+                false => Ok(None),
+            }
+        });
+        let unused = match taken.await? {
+            Taken::Yes(unused) => unused,
+            Taken::Stopped => return Ok(RunOutcome::Interrupted),
+            Taken::TooLate => return Ok(RunOutcome::InUse),
         };
         // The processes of another sweep may have changed the run while this one waited for them.
         let mut args = self.args.clone();
@@ -203,7 +220,7 @@ async fn follow(output: ChildStdout, progress: &watch::Sender<Value>) -> String 
     last
 }
 
-/// Returns whether a line of output is the summary of a run, and not a message about its progress.
+/// Returns true if a line of output is the summary of a run, and not a message about its progress.
 fn is_summary(object: &Value) -> bool {
     object.get("digest").is_some() && object.get("phase").is_none()
 }
@@ -244,24 +261,38 @@ fn lock(log: &ProcessLog) -> anyhow::Result<Option<()>> {
     }
 }
 
-/// Repeats `take` until it returns a value, as long as a process that uses `dir` may take to save and exit. Returns `None` if
-/// `stop` is cancelled first.
+/// The result of waiting for the other processes of a run.
+#[derive(Debug, PartialEq, Eq)]
+enum Taken<T> {
+    Yes(T),
+    /// The run was asked to exit first.
+    Stopped,
+    /// A process still uses the run after the time that it may take to save and exit.
+    TooLate,
+}
+
+/// Repeats `take` until it returns a value, `stop` is cancelled, or a process that uses the run should have saved and
+/// exited. Calls `on_wait` before the first pause.
 async fn retry<T>(
-    dir: &Path,
     stop: &CancellationToken,
+    on_wait: impl FnOnce(),
     mut take: impl FnMut() -> anyhow::Result<Option<T>>,
-) -> anyhow::Result<Option<T>> {
+) -> anyhow::Result<Taken<T>> {
     let n_attempts = END_TIMEOUT.as_millis() / RETRY_EVERY.as_millis();
+    let mut on_wait = Some(on_wait);
     for _ in 0..n_attempts {
         if let Some(taken) = take()? {
-            return Ok(Some(taken));
+            return Ok(Taken::Yes(taken));
+        }
+        if let Some(on_wait) = on_wait.take() {
+            on_wait();
         }
         tokio::select! {
             () = tokio::time::sleep(RETRY_EVERY) => {}
-            () = stop.cancelled() => return Ok(None),
+            () = stop.cancelled() => return Ok(Taken::Stopped),
         }
     }
-    bail!("another process still uses {}", dir.display())
+    Ok(Taken::TooLate)
 }
 
 /// Returns the last line of the log since it had `offset` bytes.
@@ -299,6 +330,23 @@ mod tests {
         check(0, "no summary", &running, &failed(0));
         check(0, "{\"digest\":\"d\",\"phase\":\"ended\"}", &running, &failed(0));
         check(70, "{\"digest\":\"d\"}", &running, &failed(70));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_run_in_use_is_waited_for_and_no_failure() {
+        let running = CancellationToken::new();
+        let mut n_waits = 0;
+        let taken = retry(&running, || n_waits += 1, || Ok(None::<()>)).await.expect("no error");
+        assert_eq!((taken, n_waits), (Taken::TooLate, 1));
+        let mut n_attempts = 0;
+        let third = || {
+            n_attempts += 1;
+            Ok((n_attempts == 3).then_some(()))
+        };
+        assert_eq!(retry(&running, || (), third).await.expect("no error"), Taken::Yes(()));
+        running.cancel();
+        let stopped = retry(&running, || (), || Ok(None::<()>)).await.expect("no error");
+        assert_eq!(stopped, Taken::Stopped);
     }
 
     #[test]

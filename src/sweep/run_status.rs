@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, anyhow};
 use serde_json::Value as Json;
 use tandem_learner::checkpoint;
+use tandem_policy::Policy;
 use tandem_report::run_summary;
 use tandem_rl::RunConfig;
 use tandem_system::{atomic_file, regular_file};
@@ -14,6 +15,8 @@ use toml::{Table, Value};
 
 use super::sweep_file::{PlannedRun, flattened};
 use crate::exit::Failed;
+use crate::service::policy_address;
+use crate::train::teacher_file::path_of_new_run;
 use crate::{policy_file, run_directory, run_file};
 
 /// A run and its status.
@@ -23,7 +26,7 @@ pub(super) struct RunStatus {
     /// The run directory.
     pub(super) dir: PathBuf,
     pub(super) state: State,
-    /// Why the latest attempt failed.
+    /// The reason why the latest attempt failed.
     pub(super) failure: Option<String>,
     /// The environment steps to which a run that had fewer is extended.
     pub(super) extends_to: Option<u64>,
@@ -75,6 +78,11 @@ impl RunStatus {
         (self.state, self.failure) = (State::Finished(summary), None);
     }
 
+    /// Notes why a run was not trained, for this start of the sweep.
+    pub(super) fn skip(&mut self, why: String) {
+        self.failure = Some(why);
+    }
+
     /// Marks a run as failed, and stores the reason, which the next start reports.
     pub(super) fn fail(&mut self, why: String) -> anyhow::Result<()> {
         let path = failure_path(&self.dir);
@@ -94,6 +102,10 @@ fn failure_path(dir: &Path) -> PathBuf {
 
 /// The setting in which a run may have less than the sweep file: such a run is extended.
 const LENGTH: &str = "stop.max_env_steps";
+
+/// The difference of a run whose settings are equal.
+const OTHER_TEACHER: &str = "its teacher is neither that of [teachers] nor, without one, the shipped one (to keep it, name \
+     the run's policy/teacher.* in [teachers])";
 
 /// Returns the state of the run in `dir`, and the length to which it is extended.
 pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
@@ -123,7 +135,7 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
     }
     let texts: Vec<String> = differences.into_iter().map(|(_, text)| text).collect();
     let differences = match texts.is_empty() {
-        true => "its teacher".to_owned(),
+        true => OTHER_TEACHER.to_owned(),
         false => texts.join(", "),
     };
     Err(anyhow!("{} was made with other settings: {differences}", run.name))
@@ -165,24 +177,57 @@ fn shortest(value: &Value) -> String {
     }
 }
 
-/// Returns whether the run's copy of its teacher equals the file that the sweep file names.
+/// Files of a run's copy of its teacher: a policy file, the model of an actor, or the server of a policy.
+const TEACHER_COPIES: [&str; 3] = ["teacher.safetensors", "teacher.onnx", "teacher.toml"];
+
+/// Returns true if the run has the teacher that the sweep file names or, if it names none, the shipped one.
+///
+/// A run without a copy of its teacher, and a teacher that does not exist, count as equal: `tandem train` reports both.
 fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
-    let Some(teacher) = &run.teacher else { return true };
-    let copy = regular_file::read(&teacher_copy(teacher, dir));
-    // The run itself reports a missing file.
-    let named = policy_file::file_of(teacher).map_err(|failed| failed.into_error());
-    let named = named.and_then(|file| Ok(regular_file::read(&file)?));
-    copy.ok().zip(named.ok()).is_none_or(|(copy, named)| copy == named)
+    if !run.config.advice.needs_teacher() {
+        return true;
+    }
+    let copies = TEACHER_COPIES.map(|name| dir.join("policy").join(name));
+    let Some(copy) = copies.iter().find(|path| path.exists()) else { return true };
+    let Ok(teacher) = path_of_new_run(run.teacher.as_deref(), &run.config) else { return true };
+    if *copy != teacher_copy(&teacher, dir) {
+        return false;
+    }
+    if let Some(address) = policy_address(&teacher) {
+        return server_of(copy).is_none_or(|server| server == address);
+    }
+    let Ok(teacher) = policy_file::file_of(&teacher) else { return true };
+    let [copied, current] = [copy, &*teacher].map(|path| regular_file::read(path).ok());
+    let is_same_file = copied.zip(current).is_none_or(|(copied, current)| copied == current);
+    is_same_file || has_same_digest(copy, &teacher)
 }
 
-/// Returns whether the run has a copy of its teacher, if it needs one that the sweep file names.
+/// Returns true if two policy files have the same digest: their networks are equal, whatever else the files contain.
+fn has_same_digest(one: &Path, other: &Path) -> bool {
+    let [one, other] = [one, other].map(|path| Policy::load(path).ok());
+    one.zip(other).is_some_and(|(one, other)| one.digest() == other.digest())
+}
+
+/// Returns the URL of the server in a run's copy of its teacher.
+fn server_of(copy: &Path) -> Option<String> {
+    let table: Table = String::from_utf8(regular_file::read(copy).ok()?).ok()?.parse().ok()?;
+    Some(table.get("address")?.as_str()?.to_owned())
+}
+
+/// Returns true if the run has a copy of its teacher, if it needs one that the sweep file names.
 pub(super) fn has_teacher_copy(run: &PlannedRun, dir: &Path) -> bool {
     run.teacher.as_ref().is_none_or(|teacher| teacher_copy(teacher, dir).exists())
 }
 
 /// Returns the path of the run's copy of `teacher`.
 fn teacher_copy(teacher: &Path, dir: &Path) -> PathBuf {
-    dir.join("policy").join(if is_onnx(teacher) { "teacher.onnx" } else { "teacher.safetensors" })
+    let [policy, actor, server] = TEACHER_COPIES;
+    let name = match policy_address(teacher) {
+        Some(_) => server,
+        None if is_onnx(teacher) => actor,
+        None => policy,
+    };
+    dir.join("policy").join(name)
 }
 
 fn has_learned(dir: &Path) -> bool {
@@ -343,5 +388,36 @@ mod tests {
         };
         assert!(with("mine").expect_err("another teacher").contains("teacher"));
         assert_eq!(with("policy/teacher.safetensors").expect("the same").state, State::Started);
+    }
+
+    #[test]
+    fn without_a_named_teacher_a_run_has_the_shipped_one_if_it_needs_one() {
+        let out = tempfile::tempdir().expect("a directory");
+        made_with(out.path(), 0.95);
+        has_ended(out.path());
+        let policies = out.path().join("push-ea-seed1/policy");
+        std::fs::create_dir(&policies).expect("a directory");
+        let shipped = path_of_new_run(None, &planned(0.95).config).expect("ships");
+        let copy = |name: &str, content: &[u8]| {
+            std::fs::write(policies.join(name), content).expect("writes");
+            status(out.path(), 0.95).map(|status| status.state_name())
+        };
+        let content = std::fs::read(shipped).expect("a policy");
+        assert_eq!(copy("teacher.safetensors", &content).expect("the shipped one"), "finished");
+        let refused = copy("teacher.safetensors", b"another").expect_err("another teacher");
+        assert!(refused.contains("in [teachers])"), "{refused}");
+        std::fs::remove_file(policies.join("teacher.safetensors")).expect("removes");
+        assert_eq!(status(out.path(), 0.95).expect("no copy").state_name(), "finished");
+        let server = b"address = \"http://127.0.0.1:7005\"\ndigest = \"5f3a\"\n";
+        assert!(copy("teacher.toml", server).is_err(), "the policy of a server");
+        let of_server = |address: &str| {
+            let run = PlannedRun { teacher: Some(address.into()), ..planned(0.95) };
+            RunStatus::of(run, out.path()).map(|status| status.state_name())
+        };
+        assert_eq!(of_server("http://127.0.0.1:7005").expect("the same server"), "finished");
+        assert!(of_server("http://127.0.0.1:7006").is_err(), "another server");
+        let mut unadvised = planned(0.95);
+        unadvised.config.advice.strategy = "none".to_owned();
+        assert!(same_teacher(&unadvised, &out.path().join("push-ea-seed1")));
     }
 }

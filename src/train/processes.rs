@@ -14,14 +14,17 @@ use super::plan::Plan;
 use super::restart_policy::{Decision, RestartPolicy, Role};
 use super::run_lock::RunLock;
 use crate::exit::Exit;
-use crate::launch::{ChildProcess, Launcher, ProcessEnd, ProcessLog};
+use crate::launch::{ChildProcess, Launcher, ProcessEnd, ProcessLog, ServiceAddresses};
 use crate::run_display::Display;
 use crate::{clock, dashboard};
 
 /// Time that the teacher and the workers have to exit after the learner.
 const GRACE: Duration = Duration::from_secs(5);
 
-pub(crate) struct RunProcesses {
+pub(crate) struct RunProcesses<'a> {
+    plan: &'a Plan,
+    /// The lock on the run directory. Once another directory has its path, no process is restarted.
+    lock: &'a RunLock,
     launcher: Launcher,
     /// The teacher, if the run has one, the learner, the workers.
     processes: Vec<Process>,
@@ -45,7 +48,7 @@ pub(crate) struct PeakMemory {
     pub(crate) worker_mib: u64,
 }
 
-/// Why a run cannot continue.
+/// The error after which a run cannot continue.
 #[derive(Debug)]
 pub(crate) struct RunFailure {
     pub(crate) exit: Exit,
@@ -58,7 +61,7 @@ impl From<anyhow::Error> for RunFailure {
     }
 }
 
-/// Whether a learner that was asked to exit has saved its state.
+/// The state of a learner that was asked to exit.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Saved {
     /// It has.
@@ -91,17 +94,20 @@ enum State {
     Waiting { until: Instant, end: ProcessEnd, reason: String },
 }
 
-/// A service that ended before it printed its address.
-struct FailedStart {
-    name: String,
-    child: ChildProcess,
-    end: ProcessEnd,
+/// The result of starting a service.
+enum ServiceStart {
+    /// It has printed its addresses.
+    Ready { process: Process, addresses: ServiceAddresses },
+    /// It ended before that.
+    Ended { name: String, child: ChildProcess, end: ProcessEnd },
 }
 
-impl RunProcesses {
+impl<'a> RunProcesses<'a> {
     /// Prepares a run whose processes log to the plan's log file.
-    pub(crate) fn new(plan: &Plan) -> anyhow::Result<Self> {
+    pub(crate) fn new((plan, lock): (&'a Plan, &'a RunLock)) -> anyhow::Result<Self> {
         Ok(Self {
+            plan,
+            lock,
             launcher: Launcher::new(ProcessLog::open(&plan.log_path())?)?,
             processes: Vec::new(),
             teacher_address: None,
@@ -114,7 +120,8 @@ impl RunProcesses {
     }
 
     /// Starts the teacher, the learner and the workers, in this order.
-    pub(crate) async fn start(&mut self, plan: &Plan, display: &Display) -> Result<(), RunFailure> {
+    pub(crate) async fn start(&mut self, display: &Display) -> Result<(), RunFailure> {
+        let plan = self.plan;
         if plan.config.advice.asks() {
             let args = arguments::teacher(plan);
             self.teacher_address = Some(self.start_service(Role::Teacher, &args, display).await?);
@@ -125,7 +132,7 @@ impl RunProcesses {
         self.learner_address = self.start_service(Role::Learner, &args, display).await?;
         for number in 1..=plan.n_workers {
             let name = format!("worker-{number}");
-            let child = self.spawn(&name, &self.worker_args(plan, &name), Stdio::null())?;
+            let child = self.spawn(&name, &self.worker_args(&name), Stdio::null())?;
             self.processes.push(Process::new(Role::Worker, name, child));
         }
         Ok(())
@@ -144,11 +151,8 @@ impl RunProcesses {
     ///
     /// # Errors
     /// When a process has ended that must not be restarted.
-    pub(crate) fn check(
-        &mut self,
-        plan: &Plan,
-        lock: &RunLock,
-    ) -> Result<ProcessEvents, RunFailure> {
+    pub(crate) fn check(&mut self) -> Result<ProcessEvents, RunFailure> {
+        let (plan, lock) = (self.plan, self.lock);
         let mut events = ProcessEvents::default();
         for idx in 0..self.processes.len() {
             let process = &mut self.processes[idx];
@@ -170,7 +174,7 @@ impl RunProcesses {
                 }
                 events.lines.push(format!("{} {end} and is restarted{reason}", process.name));
                 events.learner_restarted |= process.role == Role::Learner;
-                self.restart(idx, plan)?;
+                self.restart(idx)?;
             }
         }
         Ok(events)
@@ -197,7 +201,7 @@ impl RunProcesses {
 
     /// Asks all processes to exit and waits for them. The learner, which saves its state, has until `deadline`. The
     /// teacher, which the learner may still call, ends after it. The leases of a round that was ordered in advance stay
-    /// open. Returns whether the learner has saved its state.
+    /// open. Returns true if the learner has saved its state.
     pub(crate) async fn end(&mut self, deadline: Duration) -> Saved {
         let mut learner = None;
         let mut teacher = None;
@@ -249,13 +253,13 @@ impl RunProcesses {
     ) -> Result<String, RunFailure> {
         let mut policy = RestartPolicy::new(role);
         loop {
-            let FailedStart { name, child, end } = match self.try_start_service(role, args).await? {
-                Ok((process, address, dashboard)) => {
-                    self.show_dashboard(&dashboard, display);
+            let (name, child, end) = match self.try_start_service(role, args).await? {
+                ServiceStart::Ready { process, addresses } => {
+                    self.show_dashboard(&addresses, display);
                     self.processes.push(Process { policy, ..process });
-                    return Ok(address);
+                    return Ok(addresses.service);
                 }
-                Err(failed) => failed,
+                ServiceStart::Ended { name, child, end } => (name, child, end),
             };
             let log = self.launcher.log();
             match (end, policy.decide(end, child.uptime())) {
@@ -275,32 +279,30 @@ impl RunProcesses {
         }
     }
 
-    /// Starts a service and waits until it prints its address or ends. Returns the address, and the line about its
-    /// dashboard.
+    /// Starts a service and waits until it prints its addresses or ends.
     async fn try_start_service(
         &self,
         role: Role,
         args: &[OsString],
-    ) -> anyhow::Result<Result<(Process, String, String), FailedStart>> {
+    ) -> anyhow::Result<ServiceStart> {
         let name = format!("the {}", role.name());
         let mut child = self.spawn(&name, args, Stdio::piped())?;
-        let address = match args.iter().any(|arg| arg == arguments::DASHBOARD) {
-            true => child.addresses().await,
-            false => child.service_address().await.map(|it| it.map(|it| (it, String::new()))),
-        };
-        match address.with_context(|| format!("cannot read the address of {name}"))? {
-            Some((address, dashboard)) => {
-                Ok(Ok((Process::new(role, name, child), address, dashboard)))
+        let has_dashboard = args.iter().any(|arg| arg == arguments::DASHBOARD);
+        let addresses = child.addresses(has_dashboard).await;
+        match addresses.with_context(|| format!("cannot read the address of {name}"))? {
+            Some(addresses) => {
+                Ok(ServiceStart::Ready { process: Process::new(role, name, child), addresses })
             }
             None => {
                 let end = child.wait().await?.into();
-                Ok(Err(FailedStart { name, child, end }))
+                Ok(ServiceStart::Ended { name, child, end })
             }
         }
     }
 
     /// Restarts a process. A service gets its former address, so its clients find it again.
-    fn restart(&mut self, idx: usize, plan: &Plan) -> anyhow::Result<()> {
+    fn restart(&mut self, idx: usize) -> anyhow::Result<()> {
+        let plan = self.plan;
         let Process { role, name, .. } = &self.processes[idx];
         let teacher = self.teacher_address.as_deref();
         let (mut args, address) = match role {
@@ -308,7 +310,7 @@ impl RunProcesses {
             Role::Learner => {
                 (arguments::learner(plan, teacher, true), Some(self.learner_address.as_str()))
             }
-            Role::Worker => (self.worker_args(plan, name), None),
+            Role::Worker => (self.worker_args(name), None),
         };
         arguments::push_address(&mut args, "--listen", address);
         if *role == Role::Learner {
@@ -323,13 +325,10 @@ impl RunProcesses {
     }
 
     /// Prints the line about the dashboard, and keeps its address for the next start of the learner.
-    fn show_dashboard(&mut self, line: &str, display: &Display) {
-        if line.is_empty() {
-            return;
-        }
+    fn show_dashboard(&mut self, addresses: &ServiceAddresses, display: &Display) {
+        let Some(line) = &addresses.dashboard_line else { return };
         display.print(line);
-        let port = line.trim_end_matches('/').rsplit_once(':');
-        let port: Option<u16> = port.and_then(|(_, port)| port.parse().ok());
+        let port = dashboard::port_of(line);
         self.dashboard = self.dashboard_ip.zip(port).map(SocketAddr::from);
     }
 
@@ -338,8 +337,8 @@ impl RunProcesses {
         self.dashboard.map(dashboard::url)
     }
 
-    fn worker_args(&self, plan: &Plan, name: &str) -> Vec<OsString> {
-        arguments::worker(plan, name, &self.learner_address, self.teacher_address.as_deref())
+    fn worker_args(&self, name: &str) -> Vec<OsString> {
+        arguments::worker(self.plan, name, &self.learner_address, self.teacher_address.as_deref())
     }
 
     fn spawn(&self, name: &str, args: &[OsString], stdout: Stdio) -> anyhow::Result<ChildProcess> {

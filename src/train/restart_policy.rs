@@ -35,7 +35,7 @@ impl Role {
     }
 }
 
-/// What follows from the end of a process.
+/// The consequence of the end of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Decision {
     /// The process is restarted.
@@ -67,7 +67,7 @@ impl RestartPolicy {
             (_, ProcessEnd::Code(65)) => return Decision::Fail(Exit::Data),
             (Role::Learner, ProcessEnd::Code(70)) => return Decision::Fail(Exit::Bug),
             (Role::Learner, ProcessEnd::Code(130)) => return Decision::Interrupted,
-            // A learner that shuts down tells its workers that the run is over.
+            // A learner that shuts down reports to its workers that the run is over.
             (Role::Worker, ProcessEnd::Code(0)) => {
                 return Decision::Restart { after: FINISHED_WORKER_PAUSE };
             }

@@ -63,7 +63,7 @@ impl RunLock {
         Ok(ServiceLocks { _checkpoints: checkpoints, _ledger: ledger })
     }
 
-    /// Returns whether the path of the run directory still leads to the locked directory.
+    /// Returns true if the path of the run directory still leads to the locked directory.
     pub(super) fn is_in_place(&self) -> bool {
         self.0.is_in_place()
     }

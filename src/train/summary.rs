@@ -6,18 +6,20 @@ use serde_json::{Value, json};
 use tandem_core::Episode;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_proto::pb;
+use tandem_report::table::thousands;
 use tandem_report::{FilmStrip, run_summary};
 use tandem_system::atomic_file;
 use tandem_telemetry::LogName;
 
 use super::plan::Plan;
 use super::processes::PeakMemory;
+use super::resume_command::resume_command;
 use crate::cli::{TrainArgs, task_flags};
 use crate::columns::N_COLUMNS;
 use crate::environment_server::names_server;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, Part, measure, measure_served};
 use crate::exit::{Exit, Failed, OrExit as _};
-use crate::progress_text::{advice_text, clock_text, failures_text, grouped};
+use crate::progress_text::{advice_text, clock_text, failures_text};
 use crate::run_pages::RunPages;
 use crate::shell::shell_word;
 use crate::{environment_server, film, output, policy_file, run_directory, signals};
@@ -35,7 +37,7 @@ pub(super) fn print(
     let saved = || format!("the run is complete and saved in {}", plan.out.display());
     let (result, shown) = test(plan, args).map_err(|failed| {
         if failed.exit() == Exit::Interrupted {
-            output::message(format_args!("{}; its test was interrupted", saved()));
+            print_interrupted_test(plan, args);
         }
         failed.context(saved())
     })?;
@@ -45,7 +47,7 @@ pub(super) fn print(
         pages(plan, (result, shown), args).map_err(|failed| failed.context(saved()))?;
     let summary = match args.json {
         true => json,
-        false => summary_lines(plan, last, memory, &result, &pages).join("\n"),
+        false => summary_lines((plan, args), last, memory, &result, &pages).join("\n"),
     };
     output::print(summary).map_err(|failed| failed.context(saved()))
 }
@@ -57,7 +59,7 @@ fn save(out: &Path, summary: &str) -> Result<(), Failed> {
         .or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
-/// Removes the summary of a run that goes on.
+/// Removes the summary of a run that continues.
 pub(super) fn remove(out: &Path) -> Result<(), Failed> {
     let path = out.join(run_summary::FILE);
     match std::fs::remove_file(&path) {
@@ -117,7 +119,7 @@ fn films(result: &EvaluationResult, shown: &[Episode]) -> Result<Vec<FilmStrip>,
 }
 
 fn summary_lines(
-    plan: &Plan,
+    (plan, args): (&Plan, &TrainArgs),
     last: &pb::Progress,
     memory: PeakMemory,
     result: &EvaluationResult,
@@ -131,10 +133,10 @@ fn summary_lines(
     lines.extend(result.lines().iter().map(|line| format!("  {line}")));
     lines.push(format!(
         "training      {} env steps, {} update{}, {} round{} in {}",
-        grouped(last.env_steps),
-        grouped(last.updates),
+        thousands(last.env_steps),
+        thousands(last.updates),
         if last.updates == 1 { "" } else { "s" },
-        grouped(last.round),
+        thousands(last.round),
         if last.round == 1 { "" } else { "s" },
         clock_text(last.wall_s)
     ));
@@ -155,19 +157,25 @@ fn summary_lines(
         format!("policy        {}", plan.best_policy().display()),
         format!("curve         {}", pages.curve.display()),
         format!("report        {}", pages.report.display()),
-        format!("recordings    {}", plan.out.join("mcap").display()),
+    ]);
+    let recordings = Some(plan.logs()).filter(|logs| logs.is_dir());
+    lines.extend(recordings.map(|logs| format!("recordings    {}", logs.display())));
+    lines.extend([
         format!("log           {}", plan.log_path().display()),
         format!("state digest  {}", last.digest),
         "next".to_owned(),
     ]);
-    lines.extend(next_commands(plan).iter().map(command_line));
+    lines.extend(next_commands((plan, args), last.env_steps).iter().map(command_line));
     lines
 }
 
 /// Returns commands that use the result: evaluate it, look at it, use it elsewhere, train longer. A command consists of
-/// its beginning and its last option, which may be on another line.
-fn next_commands(plan: &Plan) -> Vec<(String, Option<String>)> {
-    let (out, policy) = (shell_word(&plan.out), shell_word(&plan.best_policy()));
+/// its beginning and its last option, which may be on another line. The run has `env_steps` environment steps.
+fn next_commands(
+    (plan, args): (&Plan, &TrainArgs),
+    env_steps: u64,
+) -> Vec<(String, Option<String>)> {
+    let policy = shell_word(&plan.best_policy());
     let is_simulated = !names_server(&plan.environment);
     let evaluate = format!("tandem eval --policy {policy}");
     let mut commands = vec![match is_simulated {
@@ -181,16 +189,22 @@ fn next_commands(plan: &Plan) -> Vec<(String, Option<String>)> {
     let log = newest_log(&plan.out);
     commands.extend(log.map(|log| (format!("tandem replay {}", shell_word(&log)), None)));
     commands.push((format!("tandem policy export {policy}"), Some("--onnx actor.onnx".to_owned())));
-    if plan.config.stop.max_env_steps > 0 {
-        let longer = 2 * plan.config.stop.max_env_steps;
-        let minutes = if plan.config.stop.max_minutes > 0.0 { " --max-minutes 0" } else { "" };
-        let success = if plan.config.stop.until_success > 0.0 { " --until-success 0" } else { "" };
+    let stop = &plan.config.stop;
+    if stop.max_env_steps > 0 {
+        let longer = longer(stop.max_env_steps, env_steps);
+        let minutes = if stop.max_minutes > 0.0 { " --max-minutes 0" } else { "" };
+        let success = if stop.until_success > 0.0 { " --until-success 0" } else { "" };
         commands.push((
-            format!("tandem train --resume --out {out}"),
+            resume_command(&plan.out, args),
             Some(format!("--max-env-steps {longer}{minutes}{success}")),
         ));
     }
     commands
+}
+
+/// Returns a limit of environment steps that makes a run longer. A run whose limit was lowered has more steps than that.
+fn longer(max_env_steps: u64, env_steps: u64) -> u64 {
+    max_env_steps.max(env_steps).saturating_mul(2)
 }
 
 /// Indents a command, and puts its last option on a second line if it is too long for a terminal.
@@ -212,8 +226,7 @@ fn newest_log(out: &Path) -> Option<PathBuf> {
 }
 
 /// Prints the command that resumes an interrupted run.
-pub(super) fn print_interrupted(plan: &Plan) {
-    let out = shell_word(&plan.out);
+pub(super) fn print_interrupted(plan: &Plan, args: &TrainArgs) {
     match run_directory::saved_round(&plan.out) {
         Some(round) => {
             output::message(format_args!(
@@ -222,7 +235,21 @@ pub(super) fn print_interrupted(plan: &Plan) {
         }
         None => output::message("interrupted before the first checkpoint. Start over with:"),
     }
-    output::message(format_args!("  tandem train --resume --out {out}"));
+    print_resume(plan, args);
+}
+
+/// Prints the command that repeats the test of a run, which was interrupted.
+fn print_interrupted_test(plan: &Plan, args: &TrainArgs) {
+    output::message(format_args!(
+        "the run is complete and saved in {}; its test was interrupted. Repeat it with:",
+        plan.out.display()
+    ));
+    print_resume(plan, args);
+}
+
+/// Prints the command that resumes the run, and writes the pages so far.
+fn print_resume(plan: &Plan, args: &TrainArgs) {
+    output::message(format_args!("  {}", resume_command(&plan.out, args)));
     // The state is saved; pages that cannot be written are left out.
     if let Ok(Some(pages)) = RunPages::write_if_evaluated(&plan.config, &plan.out) {
         output::message(format_args!("report so far: {}", pages.report.display()));
@@ -285,6 +312,12 @@ mod tests {
             std::fs::write(logs.join(name), "").expect("writes");
         }
         assert_eq!(newest_log(out.path()), Some(logs.join("eval-1000000-000.mcap")));
+    }
+
+    #[test]
+    fn a_longer_run_is_longer_than_one_whose_limit_was_lowered() {
+        assert_eq!(longer(100_000, 100_000), 200_000);
+        assert_eq!(longer(1_000, 100_000), 200_000);
     }
 
     #[test]

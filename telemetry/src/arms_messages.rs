@@ -27,7 +27,7 @@ pub(crate) enum ArmsMessage {
     Log(Log),
 }
 
-/// Whether the shapes of the arms, which take most of the space, are among the messages of a state.
+/// The content of a state's messages: the shapes of the arms take most of the space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Detail {
     Numbers,

@@ -27,11 +27,11 @@ pub struct ArmsView {
     pub stop_error: Option<String>,
     /// The faults that an operator has injected into simulated arms, as text; oldest first.
     pub injected: Vec<String>,
-    /// Whether the driver exchanges commands and states with the arms.
+    /// True if the driver exchanges commands and states with the arms.
     pub is_connected: bool,
     /// Time until the owner's lease ends unless it is renewed, seconds; `None` if the arms have no owner.
     pub lease_left_s: Option<f64>,
-    /// Whether all joints are at rest.
+    /// True if all joints are at rest.
     pub at_rest: bool,
     /// The arms; empty without a valid state.
     pub arms: Vec<ArmView>,
@@ -138,7 +138,7 @@ impl ArmsPhase {
 }
 
 impl StopView {
-    /// Returns whether an operator or a program asked for the stop, as opposed to a fault.
+    /// Returns true if an operator or a program asked for the stop, as opposed to a fault.
     #[must_use]
     pub fn is_expected(&self) -> bool {
         matches!(self.name.as_str(), "requested" | "shut-down" | "not-reset")

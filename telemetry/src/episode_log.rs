@@ -50,7 +50,7 @@ pub struct LoggedTransition {
 }
 
 impl EpisodeLog {
-    /// Returns whether every arm succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if
+    /// Returns true if every arm succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if
     /// the log is incomplete.
     #[must_use]
     pub fn succeeded(&self) -> Option<bool> {
@@ -58,7 +58,7 @@ impl EpisodeLog {
         self.ends_with(|observation, goal| task.is_success(observation, goal))
     }
 
-    /// Returns whether `arm` succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if the
+    /// Returns true if `arm` succeeds after each of the last [steps](TaskSpec::success_steps) that count; `None` if the
     /// log is incomplete.
     #[must_use]
     pub fn arm_succeeded(&self, arm: ArmIndex) -> Option<bool> {

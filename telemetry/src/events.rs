@@ -194,17 +194,6 @@ event! {
 }
 
 event! {
-    /// The last unit of an account is spent; the student acts without advice from now on.
-    pub struct BudgetExhausted<'a> {
-        /// Name of the account.
-        pub account: &'a str,
-        /// Budget, in units.
-        pub budget: u64,
-    }
-    info!(account, budget, "advice budget exhausted")
-}
-
-event! {
     /// A run ended.
     pub struct RunFinished<'a> {
         /// Reason of the end.

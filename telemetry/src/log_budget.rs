@@ -50,18 +50,11 @@ impl LogBudget {
         }
     }
 
-    /// Reads the directory and deletes the oldest logs if it exceeds the limit. Returns the number of logs deleted.
+    /// Reads the directory and deletes the oldest logs if it exceeds the limit, except the newest log, which may alone
+    /// exceed it. Returns the number of logs deleted.
     ///
     /// # Errors
     /// If the directory cannot be read or a log cannot be deleted.
-    pub fn enforce(&mut self) -> Result<usize, Error> {
-        self.enforce_except(None)
-    }
-
-    /// As [`enforce`](Self::enforce), but keeps the newest log, even if it alone exceeds the limit.
-    ///
-    /// # Errors
-    /// As [`enforce`](Self::enforce).
     pub fn enforce_but_newest(&mut self) -> Result<usize, Error> {
         let newest = read_logs(&self.directory)?.into_iter().max();
         self.enforce_except(newest.as_ref().map(|log| &*log.path))
@@ -125,7 +118,7 @@ fn is_incomplete(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "part")
 }
 
-/// Returns whether a writer holds the lock of an incomplete log.
+/// Returns true if a writer holds the lock of an incomplete log.
 fn is_being_written(path: &Path) -> bool {
     // A shared lock, because NFS refuses an exclusive one to a file that is not open for writing.
     is_incomplete(path)
@@ -186,10 +179,10 @@ mod tests {
         let writer = File::options().write(true).open(&incomplete).unwrap();
         writer.try_lock().unwrap();
         let mut budget = LogBudget::new(directory.path().to_owned(), 500);
-        assert_eq!(budget.enforce().unwrap(), 0, "other files are not counted");
+        assert_eq!(budget.enforce_except(None).unwrap(), 0, "other files are not counted");
 
         budget.limit_bytes = 400;
-        assert_eq!(budget.enforce().unwrap(), 2);
+        assert_eq!(budget.enforce_except(None).unwrap(), 2);
         assert_eq!(
             names(directory.path()),
             [
@@ -200,14 +193,14 @@ mod tests {
             ]
         );
         budget.limit_bytes = 240;
-        assert_eq!(budget.enforce().unwrap(), 1, "a log that is being written stays");
+        assert_eq!(budget.enforce_except(None).unwrap(), 1, "a log that is being written stays");
         assert!(incomplete.exists());
         drop(writer);
         budget.limit_bytes = 120;
-        assert_eq!(budget.enforce().unwrap(), 1);
+        assert_eq!(budget.enforce_except(None).unwrap(), 1);
         assert_eq!(names(directory.path()), ["eval-000001-000.mcap", "notes.txt"]);
         budget.limit_bytes = 10;
-        assert_eq!(budget.enforce().unwrap(), 1);
+        assert_eq!(budget.enforce_except(None).unwrap(), 1);
         assert_eq!(names(directory.path()), ["notes.txt"]);
     }
 

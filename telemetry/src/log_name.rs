@@ -6,7 +6,7 @@ use std::path::Path;
 /// before evaluations. The order of the names as texts differs from it once a number outgrows its digits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LogName {
-    /// Whether the episode belongs to an evaluation.
+    /// True if the episode belongs to an evaluation.
     pub is_evaluation: bool,
     /// Version of the episode's parameters, which is the number of finished rounds; the date for motions.
     pub version: u64,

@@ -1,9 +1,6 @@
 //! Initialisation of logging. Only a program calls it; libraries emit events.
 
-use std::fs::OpenOptions;
 use std::io::IsTerminal as _;
-use std::path::PathBuf;
-use std::sync::Mutex;
 
 use tracing_subscriber::Registry;
 pub use tracing_subscriber::filter::LevelFilter;
@@ -15,16 +12,14 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use crate::error::Error;
 use crate::standard_error::EventWriter;
 
-/// Destinations of log lines, and their filters.
+/// The destination of log lines, and its filter.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct LogConfig {
     /// Least severe level that is written to standard error; `None` writes nothing there.
     pub console: Option<LevelFilter>,
-    /// Whether lines on standard error are coloured if that is a terminal.
+    /// True if lines on standard error are coloured if that is a terminal.
     pub is_coloured: bool,
-    /// File to which lines of level `info` and above are appended.
-    pub file: Option<PathBuf>,
-    /// Directives that replace the levels of both destinations: `LEVEL` or `TARGET=LEVEL`, separated by commas.
+    /// Directives that replace the level: `LEVEL` or `TARGET=LEVEL`, separated by commas.
     pub directives: Option<String>,
 }
 
@@ -34,7 +29,7 @@ pub type ExtraLayer = Box<dyn Layer<Registry> + Send + Sync>;
 /// Initialises logging of this process. Lines that cannot be written are dropped.
 ///
 /// # Errors
-/// If the file cannot be opened, the directives are malformed, or logging is already initialised.
+/// If the directives are malformed, or logging is already initialised.
 pub fn init(config: &LogConfig, extra: Option<ExtraLayer>) -> Result<(), Error> {
     let console = match config.console {
         Some(level) => {
@@ -45,19 +40,7 @@ pub fn init(config: &LogConfig, extra: Option<ExtraLayer>) -> Result<(), Error> 
         }
         None => None,
     };
-    let file = match &config.file {
-        Some(path) => {
-            let file = OpenOptions::new()
-                .append(true)
-                .create(true)
-                .open(path)
-                .map_err(Error::io("open", path))?;
-            let layer = fmt::layer().with_writer(Mutex::new(file)).with_ansi(false);
-            Some(layer.with_filter(filter(LevelFilter::INFO, config)?))
-        }
-        None => None,
-    };
-    tracing_subscriber::registry().with(extra).with(console).with(file).try_init()?;
+    tracing_subscriber::registry().with(extra).with(console).try_init()?;
     Ok(())
 }
 
@@ -72,7 +55,7 @@ fn filter(level: LevelFilter, config: &LogConfig) -> Result<Targets, Error> {
     }
 }
 
-/// Returns whether `name` can be a module path.
+/// Returns true if `name` can be a module path.
 fn is_target(name: &str) -> bool {
     name.chars().all(|character| character.is_ascii_alphanumeric() || "_-:".contains(character))
 }

@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
-use tandem_core::EvaluationSummary;
+use tandem_core::{EvaluationSummary, Wilson};
 use tandem_system::regular_file;
 
 use crate::error::Error;
@@ -69,7 +69,8 @@ pub struct MetricsRow {
     pub n_episodes: u64,
     /// `true` for the best policy so far.
     pub best: bool,
-    /// Measures with contacts told apart. A file of an earlier version does not have them.
+    /// Measures that distinguish contacts between arms from contacts with the table. A file of an earlier version does not
+    /// have them.
     #[serde(flatten)]
     pub contacts: ContactMetrics,
     /// Training steps so far on which the teacher was asked. A file of an earlier version does not have them.
@@ -77,7 +78,8 @@ pub struct MetricsRow {
     pub advice_queries: Option<u64>,
 }
 
-/// Measures of an evaluation that tell contacts apart. A value that is not known is left out of the file.
+/// Measures of an evaluation that distinguish contacts between arms from contacts with the table. A value that is not
+/// known is left out of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ContactMetrics {
     /// Share of evaluation episodes that end with every object at its goal and have no contact between the arms.
@@ -116,11 +118,11 @@ impl ContactMetrics {
         }
     }
 
-    /// Returns success without contact with the bounds of its 95 % interval, if it is known.
+    /// Returns success without contact with its 95 % interval, if they are known.
     #[must_use]
-    pub fn success(&self) -> Option<[f64; 3]> {
-        let low = self.success_without_contact_low?;
-        Some([self.success_without_contact?, low, self.success_without_contact_high?])
+    pub fn success(&self) -> Option<(f64, Wilson)> {
+        let (low, high) = (self.success_without_contact_low?, self.success_without_contact_high?);
+        Some((self.success_without_contact?, Wilson { low, high }))
     }
 }
 
@@ -136,22 +138,6 @@ pub struct MetricsLog {
 }
 
 impl MetricsLog {
-    /// Opens `path`, or creates it. An incomplete last line of a killed writer is removed, with a warning.
-    ///
-    /// # Errors
-    /// If the file cannot be opened or a complete line is not a row.
-    pub fn open(path: &Path) -> Result<Self, Error> {
-        let file = OpenOptions::new()
-            .append(true)
-            .create(true)
-            .open(path)
-            .map_err(Error::io("open", path))?;
-        let log = Self { path: path.to_owned(), file };
-        let rows = Rows::read(path)?;
-        log.set_len(rows.n_bytes())?;
-        Ok(log)
-    }
-
     /// Opens `path`, or creates it, and truncates it after the last line that agrees with `rows`.
     ///
     /// Returns the log and the number of rows that it contains, which are the first of `rows`.
@@ -202,7 +188,21 @@ impl MetricsLog {
     /// # Errors
     /// If the file cannot be read or a complete line is not a row.
     pub fn read_all(path: &Path) -> Result<Vec<MetricsRow>, Error> {
-        Ok(Rows::read(path)?.rows.into_iter().map(|(_, row)| row).collect())
+        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
+        let mut rows = Vec::new();
+        for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
+            if !line.ends_with(b"\n") {
+                tracing::warn!(?path, line = line_idx + 1, "incomplete metrics row ignored");
+                break;
+            }
+            let row = serde_json::from_slice(line).map_err(|source| Error::MetricsRow {
+                path: path.to_owned(),
+                line: line_idx + 1,
+                source,
+            })?;
+            rows.push(row);
+        }
+        Ok(rows)
     }
 
     fn set_len(&self, n_bytes: usize) -> Result<(), Error> {
@@ -215,41 +215,6 @@ fn encode_line(row: &MetricsRow) -> std::io::Result<Vec<u8>> {
     let mut line = serde_json::to_vec(row)?;
     line.push(b'\n');
     Ok(line)
-}
-
-/// The rows of a file, each with the offset of the end of its line.
-struct Rows {
-    rows: Vec<(usize, MetricsRow)>,
-}
-
-impl Rows {
-    fn read(path: &Path) -> Result<Self, Error> {
-        let bytes = regular_file::read(path).map_err(Error::io("read", path))?;
-        let mut rows = Vec::new();
-        let mut end = 0;
-        for (line_idx, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
-            if !line.ends_with(b"\n") {
-                tracing::warn!(?path, line = line_idx + 1, "incomplete metrics row ignored");
-                break;
-            }
-            end += line.len();
-            let row = serde_json::from_slice(line);
-            rows.push((
-                end,
-                row.map_err(|source| Error::MetricsRow {
-                    path: path.to_owned(),
-                    line: line_idx + 1,
-                    source,
-                })?,
-            ));
-        }
-        Ok(Self { rows })
-    }
-
-    /// Returns the length of all complete lines, bytes.
-    fn n_bytes(&self) -> usize {
-        self.rows.last().map_or(0, |(end, _)| *end)
-    }
 }
 
 #[cfg(test)]
@@ -273,7 +238,7 @@ mod tests {
     fn log_of(rounds: &[u64]) -> (tempfile::TempDir, PathBuf, MetricsLog) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("metrics.jsonl");
-        let mut log = MetricsLog::open(&path).unwrap();
+        let (mut log, _) = MetricsLog::restore(&path, &[]).unwrap();
         rounds.iter().for_each(|round| log.append(&row(*round)).unwrap());
         (dir, path, log)
     }
@@ -282,7 +247,8 @@ mod tests {
     fn rows_are_read_as_they_were_written() {
         let (_dir, path, log) = log_of(&[5, 10]);
         drop(log);
-        MetricsLog::open(&path).unwrap().append(&row(15)).unwrap();
+        let (mut log, _) = MetricsLog::restore(&path, &[row(5), row(10)]).unwrap();
+        log.append(&row(15)).unwrap();
         assert_eq!(MetricsLog::read_all(&path).unwrap(), [row(5), row(10), row(15)]);
     }
 
@@ -338,7 +304,8 @@ mod tests {
         for n_bytes in [first + 1, first + 40, complete.len() - 1] {
             std::fs::write(&path, &complete[..n_bytes]).unwrap();
             assert_eq!(rounds(&path), [5]);
-            MetricsLog::open(&path).unwrap().append(&row(20)).unwrap();
+            let (mut log, _) = MetricsLog::restore(&path, &[row(5), row(10)]).unwrap();
+            log.append(&row(20)).unwrap();
             assert_eq!(rounds(&path), [5, 20]);
         }
     }

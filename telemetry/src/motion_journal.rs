@@ -110,7 +110,7 @@ impl MotionJournal {
         self.close();
     }
 
-    /// Returns whether the arms have just been stopped by a fault.
+    /// Returns true if the arms have just been stopped by a fault.
     fn is_new_fault(&self, view: &ArmsView) -> bool {
         view.stop.as_ref().is_some_and(|stop| !stop.is_expected() && view.stop != self.stop)
     }
@@ -200,7 +200,7 @@ impl OpenLog {
         self.recorder.record(view)
     }
 
-    /// Returns whether `view` does not belong to the log.
+    /// Returns true if `view` does not belong to the log.
     fn is_over(&self, view: &ArmsView) -> bool {
         let is_other = view.motion.is_some()
             && (self.motion != Some(view.n_motions) || self.outcome.is_some());

@@ -81,7 +81,7 @@ pub struct EpisodeRecorder {
     stats: pb::Stats,
     successes: Successes,
     time_ns: u64,
-    /// Whether the log is flushed while it is written.
+    /// True if the log is flushed while it is written.
     is_flushed: bool,
 }
 
@@ -129,7 +129,7 @@ impl EpisodeRecorder {
         self.check_lengths(transition)?;
         let scene = scene.into();
         self.set_time(scene, transition.step)?;
-        self.goal = transition.goal.to_vec();
+        transition.goal.clone_into(&mut self.goal);
         self.update_stats(scene, transition);
         self.successes.count(&self.layout, transition.observation, &self.goal);
         let caption = self.step_caption(transition);

@@ -118,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 106] = [
+const CASES: [(&str, i32, &str); 112] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -139,6 +139,9 @@ const CASES: [(&str, i32, &str); 106] = [
     ("train --no-dashboard --set ddpg.n_hidden=4096 --set ddpg.n_hidden_layers=2", 64, "66 MiB"),
     ("train --arms two", 64, "two"),
     ("train --seed -1", 64, "-1"),
+    ("train --seed 18446744073709551615", 64, "below 2^63"),
+    ("train --max-env-steps 1e19", 64, "below 2^63"),
+    ("train --live --record none", 64, "--live shows recorded episodes"),
     ("train --task shove", 64, "shove"),
     ("train --strategy bogus", 64, "bogus"),
     ("train --workers 0", 64, "--workers"),
@@ -172,6 +175,13 @@ const CASES: [(&str, i32, &str); 106] = [
     ("eval --composed-teachers %teacher-push --robustness", 64, "--policy"),
     ("eval --composed-teachers %teacher-push --baselines", 64, "--policy"),
     ("eval --policy %teacher-push --episodes 1 --record @folder", 64, "not a regular file"),
+    ("eval --policy @whole --episodes 1 --record @whole", 64, "--policy is the same file"),
+    (
+        "eval --policy @whole --episodes 1 --record @x.png --film @x.png",
+        64,
+        "--record is the same file",
+    ),
+    ("report @folder --out @whole", 64, "the name must end in .html"),
     ("bridge trial --policy %student-push --policy %student-push", 64, "\"student-push\""),
     ("bridge trial --policy %student-push --mode twin --mode twin", 64, "--mode twin"),
     ("bench scale --workers 0 --idle 0", 64, "nothing to measure"),
@@ -273,6 +283,38 @@ fn unusable_inputs_are_reported_in_one_line() {
         assert!(stderr.len() < 3000, "{line}: {} bytes", stderr.len());
     }
     assert!(!directory.path().join("mended").exists(), "garbage was recovered");
+}
+
+#[test]
+fn a_report_prints_its_tables_without_a_page_and_replaces_no_file_of_a_run() {
+    let directory = tempfile::tempdir().expect("a directory");
+    prepare(directory.path());
+    let path = |name: &str| directory.path().join(name).display().to_string();
+    let recorded = format!(
+        "{}/docs/results/students/shared-push-2-mc-q-0.1-seed1/metrics.jsonl",
+        env!("CARGO_MANIFEST_DIR")
+    );
+    let metrics = fs::read(recorded).expect("metrics");
+    fs::create_dir(path("done")).expect("created");
+    fs::write(path("done/metrics.jsonl"), &metrics).expect("written");
+    let report = |option: &str, file: &str| {
+        let (run, file) = (path("done"), path(file));
+        let args = ["report", &run, option, &file];
+        let output = command(&args, directory.path()).output().expect("runs");
+        let [stdout, stderr] = [output.stdout, output.stderr].map(String::from_utf8);
+        (output.status.code(), stdout.expect("text"), stderr.expect("text"))
+    };
+    let (code, tables, message) = report("--out", "empty/x.html");
+    assert_eq!(code, Some(64), "{message}");
+    assert!(message.contains("choose another --out"), "{message}");
+    assert!(
+        tables.contains("success of the policy alone") && !tables.contains("report  "),
+        "{tables}"
+    );
+    let (code, tables, message) = report("--csv", "done/metrics.jsonl");
+    assert_eq!((code, tables.as_str()), (Some(64), ""), "{message}");
+    assert!(message.contains("the report reads this file"), "{message}");
+    assert_eq!(fs::read(path("done/metrics.jsonl")).expect("there"), metrics);
 }
 
 #[test]

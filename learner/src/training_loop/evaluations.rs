@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary};
+use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Wilson};
 use tandem_policy::Policy;
 use tandem_policy::policy::RANDOMIZATION_KEY;
 use tandem_rl::config::Recipe;
@@ -199,9 +199,10 @@ fn add_summary(row: &mut MetricsRow, summary: &EvaluationSummary) {
 /// If one of them does not tell contacts apart, because the task does not report them or an earlier version made the
 /// evaluation, success takes the place of success without contact.
 fn is_better(row: &MetricsRow, than: &MetricsRow, is_cooldown: bool) -> bool {
-    let success = |row: &MetricsRow| [row.success, row.success_low, row.success_high];
+    let success =
+        |row: &MetricsRow| (row.success, Wilson { low: row.success_low, high: row.success_high });
     let without_contact = row.contacts.success().zip(than.contacts.success());
-    let ([here, _, high], [there, low, _]) =
+    let ((here, Wilson { high, .. }), (there, Wilson { low, .. })) =
         without_contact.unwrap_or_else(|| (success(row), success(than)));
     if is_cooldown && high >= low {
         return true;

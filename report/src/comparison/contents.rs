@@ -1,4 +1,4 @@
-//! Which tables and columns a section has.
+//! The tables and columns of a section.
 
 use super::{Comparison, Section};
 use crate::group::SeedGroup;
@@ -16,24 +16,24 @@ impl Section {
         }
     }
 
-    /// Returns whether the task may have contacts between arms: it reports contacts and has several arms. True if the
+    /// Returns true if the task may have contacts between arms: it reports contacts and has several arms. True if the
     /// task is unknown.
     pub(super) fn may_have_arm_contact(&self) -> bool {
         self.setup.n_arms != Some(1) && self.reports_contacts()
     }
 
-    /// Returns whether all runs have evaluated the success without contact between the arms, of which there are several.
+    /// Returns true if all runs have evaluated the success without contact between the arms, of which there are several.
     pub(crate) fn has_success_without_contact(&self) -> bool {
         self.may_have_arm_contact()
             && self.groups.iter().all(SeedGroup::has_success_without_contact)
     }
 
-    /// Returns whether the task reports contacts; true if it is unknown.
+    /// Returns true if the task reports contacts or is unknown.
     pub(crate) fn reports_contacts(&self) -> bool {
         self.groups.iter().flat_map(|group| &group.runs).all(Run::reports_contacts)
     }
 
-    /// Returns whether plots of this metric show something: advice is that of runs that took some.
+    /// Returns true if plots of this metric show something: advice is that of runs that took some.
     pub(crate) fn shows(&self, quantity: Quantity) -> bool {
         match quantity {
             Quantity::SuccessWithoutContact => self.has_success_without_contact(),
@@ -44,7 +44,7 @@ impl Section {
         }
     }
 
-    /// Returns whether the paper has the task; true if it is unknown.
+    /// Returns true if the paper has the task or the task is unknown.
     pub(crate) fn is_in_paper(&self) -> bool {
         let built_in = self.setup.built_in();
         self.setup.task.is_none() || built_in.is_some_and(tandem_core::Task::is_in_paper)
@@ -52,13 +52,13 @@ impl Section {
 }
 
 impl Comparison {
-    /// Returns whether the paper has one of the tasks.
+    /// Returns true if the paper has one of the tasks.
     pub(crate) fn is_in_paper(&self) -> bool {
         self.sections.iter().any(Section::is_in_paper)
     }
 }
 
-/// Returns whether the label of a group is its strategy, with the settings in which it differs from others.
+/// Returns true if the label of a group is its strategy, with the settings in which it differs from others.
 fn is_labelled_by_strategy(group: &SeedGroup) -> bool {
     let after = group.strategy.as_deref().and_then(|strategy| group.label.strip_prefix(strategy));
     after.is_some_and(|rest| rest.is_empty() || rest.starts_with([',', ' ']))
@@ -74,10 +74,12 @@ mod tests {
         let run = |name: &&str| Run {
             name: (*name).to_owned(),
             rows: vec![MetricsRow { env_steps: 100, n_episodes: 8, ..MetricsRow::default() }],
-            configuration: Some(format!(
+            configuration: format!(
                 "task = {task:?}\narms = {n_arms}\nlabel = {:?}\n[advice]\nstrategy = \"ea\"",
                 name.split("-seed").next().unwrap_or_default()
-            )),
+            )
+            .parse()
+            .ok(),
             ..Run::default()
         };
         let comparison = Comparison::of(names.iter().map(run).collect(), Vec::new());

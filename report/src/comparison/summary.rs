@@ -38,7 +38,7 @@ impl Section {
                 label.clone(),
                 NONE.to_owned(),
                 three_digits(test.success),
-                range(test.interval.0, test.interval.1),
+                range(test.interval.low, test.interval.high),
                 optional(without_contact, three_digits),
                 NONE.to_owned(),
             ]

@@ -30,11 +30,13 @@ pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
         body.push_str(&format!("<h2>Learning from scratch</h2>{grid}"));
     }
     let paragraph = |text: &str| format!("<p>{}</p>", escaped(text));
+    body.push_str("<h2>Notes</h2>");
+    body.extend(comparison.warnings.iter().map(|warning| paragraph(warning)));
     if !comparison.is_in_paper() {
-        body.push_str(&format!("<h2>Notes</h2>{}", paragraph(NOTES)));
+        body.push_str(&paragraph(NOTES));
         return body;
     }
-    body.push_str(&format!("<h2>Notes</h2>{}{}", paragraph(LEGEND), paragraph(NOTES)));
+    body.push_str(&format!("{}{}", paragraph(LEGEND), paragraph(NOTES)));
     let source = format!("<p>{}</p><p>{}</p>", escaped(PAPER_NOTES), escaped(paper::SOURCE));
     let paper = format!("{}{source}", titled_table(&paper_table()));
     body.push_str(&details("The paper's values", &paper));

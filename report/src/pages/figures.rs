@@ -34,7 +34,7 @@ pub(super) fn remove_former(directory: &Path, written: &[PathBuf]) -> Result<(),
     Ok(())
 }
 
-/// Returns whether reports give files this name.
+/// Returns true if reports give files this name.
 fn is_figure(name: &str) -> bool {
     match name.rsplit_once('.') {
         Some((stem, "svg")) => plots::is_file_stem(stem) || trials::is_file_stem(stem),

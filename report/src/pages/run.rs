@@ -10,7 +10,7 @@ use crate::error::Error;
 use crate::html::{details, drawing_grid, escaped, film_strip, table};
 use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::table::{NONE, duration, interval, number, optional, share, thousands};
+use crate::table::{NONE, duration, interval, number, optional, percent_range, share, thousands};
 
 /// The tile of a task that reports contacts.
 const CONTACT_TILE: &str = "with contact";
@@ -47,18 +47,19 @@ pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
     if !run.rows.is_empty() {
         body.push_str(&details("Evaluations", &evaluations(&run.rows, task.as_ref())));
     }
-    if let Some(text) = &run.configuration {
-        body.push_str(&details("Configuration", &format!("<pre>{}</pre>", escaped(text))));
+    if let Some(configuration) = &run.configuration {
+        let text = escaped(configuration.text());
+        body.push_str(&details("Configuration", &format!("<pre>{text}</pre>")));
     }
     Ok(body)
 }
 
-/// Returns whether the task reports contacts; true if it is unknown.
+/// Returns true if the task reports contacts or is unknown.
 fn reports_contacts(task: Option<&TaskSpec>) -> bool {
     task.is_none_or(TaskSpec::reports_contacts)
 }
 
-/// Returns whether the task has several arms; true if it is unknown.
+/// Returns true if the task has several arms or is unknown.
 fn has_several_arms(task: Option<&TaskSpec>) -> bool {
     task.is_none_or(|task| task.n_arms() > 1)
 }
@@ -83,11 +84,11 @@ fn task_line(task: &TaskSpec) -> String {
 /// Returns the first number of the page: the success on test goals, or else in the best evaluation.
 fn headline(run: &Run, best: &MetricsRow) -> String {
     let (success, interval, goals) = match &run.test {
-        Some(test) => {
-            let (low, high) = test.interval;
-            let interval = format!("{:.1}–{:.1} %", 100.0 * low, 100.0 * high);
-            (test.success, interval, format!("{} test goals", thousands(test.n_episodes)))
-        }
+        Some(test) => (
+            test.success,
+            percent_range(test.interval),
+            format!("{} test goals", thousands(test.n_episodes)),
+        ),
         None => (
             best.success,
             interval(best),
@@ -103,16 +104,15 @@ fn headline(run: &Run, best: &MetricsRow) -> String {
 /// Returns the key values of a run, one tile each.
 fn tiles(best: &MetricsRow, last: &MetricsRow, is_shown: impl Fn(&str) -> bool) -> String {
     let per_arm: Vec<String> = best.success_per_arm.iter().map(|success| share(*success)).collect();
-    let without_contact = best.contacts.success().map(|[success, low, high]| {
+    let without_contact = best.contacts.success().map(|(success, interval)| {
         let arm_contact = optional(best.contacts.arm_contact_rate, share);
         let table_contact = optional(best.contacts.table_contact_rate, share);
         (
             WITHOUT_ARM_CONTACT_TILE,
             share(success),
             format!(
-                "95 % interval {:.1}–{:.1} %; contact between arms: {arm_contact}, with table: {table_contact}",
-                100.0 * low,
-                100.0 * high
+                "95 % interval {}; contact between arms: {arm_contact}, with table: {table_contact}",
+                percent_range(interval)
             ),
         )
     });

@@ -1,4 +1,4 @@
-//! Which groups share a plot.
+//! The groups that share a plot.
 
 use crate::group::SeedGroup;
 use crate::paper::split_strategy;
@@ -83,7 +83,7 @@ fn with_their_strategies<'a>(
     plain.iter().filter(is_origin).chain(others).copied().collect()
 }
 
-/// Returns whether a group represents its strategy: it has the usual threshold, or the largest if no group has that.
+/// Returns true if a group represents its strategy: it has the usual threshold, or the largest if no group has that.
 fn represents_strategy(group: &SeedGroup, all: &[&SeedGroup]) -> bool {
     let threshold =
         |group: &SeedGroup| split_strategy(group.strategy.as_deref().unwrap_or_default()).1;

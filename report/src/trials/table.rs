@@ -4,7 +4,7 @@ use tandem_core::{Task, Wilson};
 
 use super::{CAUSES, OTHER_CAUSES, TrialGroup, Trials};
 use crate::paper::{N_PAPER_TRIALS, PaperTrials, TABLE_4};
-use crate::table::{NONE, Table, optional, wrapped};
+use crate::table::{NONE, Table, optional, paragraph};
 
 /// Number of arms in the paper's trials.
 const N_PAPER_ARMS: usize = 2;
@@ -47,7 +47,7 @@ fn failures_text(group: &TrialGroup) -> Option<String> {
     let causes: Vec<String> =
         causes.filter(|(_, n)| *n > 0).map(|(cause, n)| format!("{n} {cause}")).collect();
     let text = format!("failures of {}: {}", group.label(), causes.join(", "));
-    (!causes.is_empty()).then(|| wrapped(&text))
+    (!causes.is_empty()).then(|| paragraph(&text))
 }
 
 /// Returns the table of the groups of one task. The paper's rows follow if it has the task and a group has as many arms as

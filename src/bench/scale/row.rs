@@ -47,7 +47,7 @@ impl Reading {
 /// The measured rounds.
 pub(super) struct Rounds {
     pub(super) env_steps: usize,
-    /// When each round started, from the first one to the one after the last.
+    /// The start of each round, from the first one to the one after the last.
     pub(super) starts: Vec<Duration>,
 }
 

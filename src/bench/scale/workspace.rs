@@ -112,7 +112,7 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Returns whether the process runs.
+    /// Returns true if the process runs.
     pub(super) fn is_alive(&mut self) -> bool {
         matches!(self.child.try_wait(), Ok(None))
     }

@@ -35,7 +35,7 @@ pub struct Follower {
     subscribed: Arc<Subscribed>,
 }
 
-/// Whether a viewer has subscribed to a channel since this was read last.
+/// True if a viewer has subscribed to a channel since this was read last.
 #[derive(Default)]
 struct Subscribed(AtomicBool);
 

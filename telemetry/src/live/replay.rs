@@ -38,7 +38,7 @@ struct LogSpan {
     end_ns: u64,
 }
 
-/// What the connections of viewers change.
+/// Playback state that viewers control.
 struct Control {
     clock: Clock,
     transport: Mutex<Transport>,

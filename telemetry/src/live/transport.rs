@@ -34,12 +34,12 @@ impl Transport {
         self.position_ns.saturating_add(played_ns).min(self.end_ns)
     }
 
-    /// Returns whether the position moves.
+    /// Returns true if the position moves.
     pub(super) const fn is_playing(&self) -> bool {
         self.is_playing
     }
 
-    /// Returns whether the end is reached at the time `now`.
+    /// Returns true if the end is reached at the time `now`.
     pub(super) fn has_ended(&self, now: Duration) -> bool {
         self.position_ns(now) == self.end_ns
     }
