@@ -2,8 +2,7 @@
 //!
 //! It has the steps of section 2.2 of the paper, with the target networks of section 4.2: the critic's target and loss
 //! (equation 5), the actor's loss (equation 4), a step of Adam for each, and Polyak averaging of the target networks.
-//! Both gradients are taken at the same parameters, so the critic's half and the actor's half of an update can run in
-//! parallel.
+//! Both gradients are taken at the same parameters, so the updates of critic and actor can run in parallel.
 //!
 //! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks
 //! of rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks
@@ -15,17 +14,17 @@ use std::ops::Range;
 use tandem_core::{Stream, TaskSpec, episode_rng};
 use tandem_policy::{Activations, MatrixMut, MlpShape, tanh};
 
-mod actor_half;
+mod actor_update;
 mod config;
-mod critic_half;
+mod critic_update;
 mod network;
 mod state;
 #[cfg(test)]
 mod tests;
 mod threads;
 
-use actor_half::{ActorHalf, ActorRows, QFilter};
-use critic_half::{CriticHalf, CriticRows};
+use actor_update::{ActorRows, ActorUpdate, QFilter};
+use critic_update::{CriticRows, CriticUpdate};
 use network::Network;
 use threads::{for_each, in_pool};
 
@@ -142,8 +141,8 @@ pub struct Ddpg {
     n_updates: u64,
     actor: Network,
     critic: Network,
-    actor_half: ActorHalf,
-    critic_half: CriticHalf,
+    actor_update: ActorUpdate,
+    critic_update: CriticUpdate,
     /// The critic's head that values each component of an action; `None` is the sum of all heads.
     heads: Vec<Option<usize>>,
     /// Blocks of rows of the passes.
@@ -182,8 +181,8 @@ impl Ddpg {
             n_updates: 0,
             actor: network(actor_shape, 0, config.actor_learning_rate),
             critic: network(critic_shape, 1, config.critic_learning_rate),
-            actor_half: ActorHalf::new(&config, &actor_shape, &critic_shape),
-            critic_half: CriticHalf::new(&config, rewards.lowest, &critic_shape),
+            actor_update: ActorUpdate::new(&config, &actor_shape, &critic_shape),
+            critic_update: CriticUpdate::new(&config, rewards.lowest, &critic_shape),
             heads: heads_of_actions(&layout, rewards.n_heads),
             row_blocks,
             scratch: Vec::new(),
@@ -208,9 +207,9 @@ impl Ddpg {
             self.pass_over_rows(batch);
             self.step_parameters(batch)
         });
-        let Self { config, actor_half, critic_half, .. } = self;
-        let critic_loss = critic_half.loss(config.transitions_per_update());
-        let (actor_loss, mean_q) = actor_half.loss_and_mean_q(config, batch);
+        let Self { config, actor_update, critic_update, .. } = self;
+        let critic_loss = critic_update.loss(config.transitions_per_update());
+        let (actor_loss, mean_q) = actor_update.loss_and_mean_q(config, batch);
         self.n_updates += 1;
         let checks = [
             ("a critic loss", critic_loss.is_finite()),
@@ -244,7 +243,8 @@ impl Ddpg {
         Sizes { n_input, n_action, n_heads: critic.shape.n_output }
     }
 
-    /// Makes all passes that are independent for each row: values, targets, and the gradients by all activations.
+    /// Makes all passes that are independent for each row: values, targets, and the gradients with respect to all
+    /// activations.
     fn pass_over_rows(&mut self, batch: &Batch) {
         enum Rows<'a> {
             Critic(CriticRows<'a>),
@@ -253,10 +253,10 @@ impl Ddpg {
             Both(Box<(CriticRows<'a>, ActorRows<'a>)>),
         }
         let sizes = self.sizes();
-        let Self { config, actor, critic, actor_half, critic_half, heads, .. } = self;
+        let Self { config, actor, critic, actor_update, critic_update, heads, .. } = self;
         let (config, actor, critic, heads) = (&*config, &*actor, &*critic, &**heads);
-        let critic_rows = critic_half.rows(batch, &self.row_blocks, sizes).into_iter();
-        let actor_rows = actor_half.rows(batch, &self.row_blocks, sizes).into_iter();
+        let critic_rows = critic_update.rows(batch, &self.row_blocks, sizes).into_iter();
+        let actor_rows = actor_update.rows(batch, &self.row_blocks, sizes).into_iter();
         let tasks = if self.filters_advice && config.bc_weight > 0.0 {
             critic_rows.zip(actor_rows).map(|rows| Rows::Both(Box::new(rows))).collect()
         } else {
@@ -276,17 +276,19 @@ impl Ddpg {
         });
     }
 
-    /// Makes a step of Adam with the gradients by the parameters, and returns which parameters are finite.
+    /// Makes a step of Adam with the gradients with respect to the parameters, and returns which parameters are finite.
     fn step_parameters(&mut self, batch: &Batch) -> Finite {
         let b = self.config.transitions_per_update();
-        let Self { actor, critic, actor_half, critic_half, scratch, .. } = self;
-        let actor_gradient = actor_half.gradient(&actor.shape, batch, b);
-        let critic_gradient = critic_half.gradient(&critic.shape, b);
+        let Self { actor, critic, actor_update, critic_update, scratch, .. } = self;
+        let actor_gradient = actor_update.gradient_inputs(&actor.shape, batch, b);
+        let critic_gradient = critic_update.gradient_inputs(&critic.shape, b);
         let mut tasks = critic.step(&critic_gradient);
         tasks.extend(actor.step(&actor_gradient));
         for_each(scratch, tasks, |_, task| task.run());
-        let finite =
-            Finite { actor: actor_gradient.is_finite(), critic: critic_gradient.is_finite() };
+        let finite = Finite {
+            actor: actor_gradient.parameters_are_finite(),
+            critic: critic_gradient.parameters_are_finite(),
+        };
         let mut tasks = critic.transpose();
         tasks.extend(actor.transpose());
         for_each(scratch, tasks, |_, task| task.run());
@@ -403,10 +405,10 @@ fn write_columns(
 fn action_columns<'a>(
     input: &'a mut [f32],
     actor: &MlpShape,
-    n_joined: usize,
+    n_state_action: usize,
     n_rows: usize,
 ) -> MatrixMut<'a> {
-    MatrixMut::with_stride(&mut input[actor.n_input..], n_rows, actor.n_output, n_joined)
+    MatrixMut::with_stride(&mut input[actor.n_input..], n_rows, actor.n_output, n_state_action)
 }
 
 /// Applies tanh to every action.

@@ -31,7 +31,7 @@ pub struct CriticEnsemble {
     workspace: Workspace,
     /// Values of a batch, shape `[b, n_heads]`.
     q: Vec<f32>,
-    /// The loss's gradient by `q`.
+    /// Gradient of the loss with respect to `q`.
     q_gradient: Vec<f32>,
     gradient: Vec<f32>,
 }

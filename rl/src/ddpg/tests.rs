@@ -4,8 +4,8 @@ use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_policy::MlpShape;
 
-use super::actor_half::QFilter;
-use super::critic_half::critic_target;
+use super::actor_update::QFilter;
+use super::critic_update::critic_target;
 use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses, heads_of_actions};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
