@@ -28,7 +28,7 @@ use critic_update::{CriticRows, CriticUpdate};
 use network::Network;
 use threads::{for_each, in_pool};
 
-pub use config::DdpgConfig;
+pub use config::{DdpgConfig, UpdateSettings};
 pub use state::CriticBatch;
 
 /// A batch of `b` transitions. An input is a normalised observation followed by a normalised goal.
@@ -136,8 +136,6 @@ pub enum DdpgError {
 #[derive(Debug, Clone)]
 pub struct Ddpg {
     config: DdpgConfig,
-    /// Whether advice is cloned only where the critic values it above the actor's own action.
-    filters_advice: bool,
     n_updates: u64,
     actor: Network,
     critic: Network,
@@ -149,6 +147,15 @@ pub struct Ddpg {
     row_blocks: Vec<Range<usize>>,
     /// One for each thread.
     scratch: Vec<Scratch>,
+}
+
+/// The settings and networks of the passes of an update, which all rows share.
+#[derive(Debug, Clone, Copy)]
+struct Pass<'a> {
+    config: &'a DdpgConfig,
+    settings: UpdateSettings,
+    actor: &'a Network,
+    critic: &'a Network,
 }
 
 /// A thread's memory for the passes whose activations are not used after them.
@@ -177,7 +184,6 @@ impl Ddpg {
         let critic_shape = MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads);
         let row_blocks = critic_shape.row_blocks(config.transitions_per_update());
         let mut ddpg = Self {
-            filters_advice: false,
             n_updates: 0,
             actor: network(actor_shape, 0, config.actor_learning_rate),
             critic: network(critic_shape, 1, config.critic_learning_rate),
@@ -193,23 +199,29 @@ impl Ddpg {
     }
 
     /// Makes one gradient step of critic and actor on `batch`, which holds the transitions of all batches of an update.
-    /// The gradients of the batches are summed.
+    /// The gradients of the batches are summed. `settings` are those of the present round.
     ///
     /// # Errors
     /// When a loss or a parameter is no longer finite. The networks are unusable then.
     ///
     /// # Panics
     /// When the batch does not have [`DdpgConfig::transitions_per_update`] rows, or another layout.
-    pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
+    pub fn update(
+        &mut self,
+        settings: UpdateSettings,
+        batch: &Batch,
+    ) -> Result<UpdateLosses, DdpgError> {
         self.check_size(batch);
+        self.actor.adam.set_learning_rate(settings.actor_learning_rate);
+        self.critic.adam.set_learning_rate(settings.critic_learning_rate);
         let n_threads = self.scratch.len();
         let finite = in_pool(n_threads, || {
-            self.pass_over_rows(batch);
+            self.pass_over_rows(settings, batch);
             self.step_parameters(batch)
         });
         let Self { config, actor_update, critic_update, .. } = self;
         let critic_loss = critic_update.loss(config.transitions_per_update());
-        let (actor_loss, mean_q) = actor_update.loss_and_mean_q(config, batch);
+        let (actor_loss, mean_q) = actor_update.loss_and_mean_q(config, settings.bc_weight, batch);
         self.n_updates += 1;
         let checks = [
             ("a critic loss", critic_loss.is_finite()),
@@ -245,7 +257,7 @@ impl Ddpg {
 
     /// Makes all passes that are independent for each row: values, targets, and the gradients with respect to all
     /// activations.
-    fn pass_over_rows(&mut self, batch: &Batch) {
+    fn pass_over_rows(&mut self, settings: UpdateSettings, batch: &Batch) {
         enum Rows<'a> {
             Critic(CriticRows<'a>),
             Actor(ActorRows<'a>),
@@ -254,24 +266,24 @@ impl Ddpg {
         }
         let sizes = self.sizes();
         let Self { config, actor, critic, actor_update, critic_update, heads, .. } = self;
-        let (config, actor, critic, heads) = (&*config, &*actor, &*critic, &**heads);
+        let (pass, heads) = (Pass { config, settings, actor, critic }, &**heads);
         let critic_rows = critic_update.rows(batch, &self.row_blocks, sizes).into_iter();
         let actor_rows = actor_update.rows(batch, &self.row_blocks, sizes).into_iter();
-        let tasks = if self.filters_advice && config.bc_weight > 0.0 {
+        let tasks = if settings.filters_advice && settings.bc_weight > 0.0 {
             critic_rows.zip(actor_rows).map(|rows| Rows::Both(Box::new(rows))).collect()
         } else {
             critic_rows.map(Rows::Critic).chain(actor_rows.map(Rows::Actor)).collect()
         };
         for_each(&mut self.scratch, tasks, |scratch, rows| match rows {
             Rows::Critic(rows) => {
-                rows.differentiate(config, actor, critic, scratch);
+                rows.differentiate(pass, scratch);
             }
-            Rows::Actor(rows) => rows.differentiate(None, config, actor, critic, scratch),
+            Rows::Actor(rows) => rows.differentiate(None, pass, scratch),
             Rows::Both(rows) => {
                 let (critic_rows, actor_rows) = *rows;
-                let executed_q = critic_rows.differentiate(config, actor, critic, scratch);
+                let executed_q = critic_rows.differentiate(pass, scratch);
                 let filter = QFilter { executed_q, heads };
-                actor_rows.differentiate(Some(filter), config, actor, critic, scratch);
+                actor_rows.differentiate(Some(filter), pass, scratch);
             }
         });
     }
@@ -302,29 +314,6 @@ impl Ddpg {
         let mut tasks = critic.polyak();
         tasks.extend(actor.polyak());
         in_pool(scratch.len(), || for_each(scratch, tasks, |_, task| task.run(keep)));
-    }
-
-    /// Switches between the usual learning rates and that of the cooldown.
-    pub fn set_cooldown(&mut self, is_cooldown: bool) {
-        let Self { config, actor, critic, .. } = self;
-        let rate = |usual| if is_cooldown { config.cooldown_learning_rate } else { usual };
-        actor.adam.set_learning_rate(rate(config.actor_learning_rate));
-        critic.adam.set_learning_rate(rate(config.critic_learning_rate));
-    }
-
-    /// Sets the discount per control step, in [0, 1), for the updates that follow.
-    pub const fn set_discount(&mut self, discount: f32) {
-        self.config.discount = discount;
-    }
-
-    /// Sets the weight of behaviour cloning, 0 or more, for the updates that follow.
-    pub const fn set_bc_weight(&mut self, weight: f32) {
-        self.config.bc_weight = weight;
-    }
-
-    /// Sets whether the updates that follow clone advice only where the critic values it above the actor's own action.
-    pub const fn set_bc_filter(&mut self, filters_advice: bool) {
-        self.filters_advice = filters_advice;
     }
 
     /// Sets how many threads of the rayon pool work on an update; 0 means 1. The results are the same, bit for bit.

@@ -249,16 +249,13 @@ impl Trainer {
             observation: self.observation_normalizer.snapshot(),
             goal: self.goal_normalizer.snapshot(),
         };
-        self.ddpg.set_cooldown(self.config.is_cooldown(self.counters.round));
-        self.ddpg.set_discount(self.config.discount(self.counters.round));
-        self.ddpg.set_bc_weight(self.config.bc_weight(self.counters.round));
-        self.ddpg.set_bc_filter(self.config.filters_advice(self.counters.round));
-        self.sampler.set_contact_cost(self.config.contact_cost(self.counters.round));
+        let settings = self.config.at_round(self.counters.round);
+        self.sampler.set_contact_cost(settings.contact_cost);
         let n_updates = self.config.updates_per_round();
         let mut sums = RoundStats::default();
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
-            let losses = self.ddpg.update(&self.batch)?;
+            let losses = self.ddpg.update(settings.update, &self.batch)?;
             if let Some(ensemble) = &mut self.ensemble
                 && !ensemble.update(self.ddpg.critic_batch())
             {

@@ -94,7 +94,7 @@ impl<'a> Evaluations<'a> {
         let mut row = self.training_row(&pending);
         let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
         add_summary(&mut row, &EvaluationSummary::of(&outcomes));
-        let is_cooldown = row.round > 0 && self.config.run.is_cooldown(row.round - 1);
+        let is_cooldown = row.round > 0 && self.config.run.at_round(row.round - 1).is_cooldown;
         let best = self.history().best_row();
         row.best = best.is_none_or(|best| is_better(&row, best, is_cooldown));
         EvaluationFinished {

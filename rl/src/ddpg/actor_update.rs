@@ -4,9 +4,10 @@ use std::ops::Range;
 
 use tandem_policy::{Activations, Matrix, MatrixMut, MlpShape, RowBlock};
 
-use super::network::{Network, ParameterGradientInputs};
+use super::network::ParameterGradientInputs;
 use super::{
-    Batch, BatchRows, DdpgConfig, Scratch, Sizes, action_columns, split_rows, squash, write_columns,
+    Batch, BatchRows, DdpgConfig, Pass, Scratch, Sizes, action_columns, split_rows, squash,
+    write_columns,
 };
 
 /// The actor's part of an update: its batch, values and gradients.
@@ -91,11 +92,16 @@ impl ActorUpdate {
     }
 
     /// Returns the loss and the mean value, after all rows of `batch`.
-    pub(super) fn loss_and_mean_q(&self, config: &DdpgConfig, batch: &Batch) -> (f64, f64) {
+    pub(super) fn loss_and_mean_q(
+        &self,
+        config: &DdpgConfig,
+        bc_weight: f32,
+        batch: &Batch,
+    ) -> (f64, f64) {
         let b = config.transitions_per_update();
         let n_action = self.action_gradient.len() / b;
         let n_state_action = self.input.len() / b;
-        let terms = ActionTerms::new(config, n_action);
+        let terms = ActionTerms::new(config, bc_weight, n_action);
         let executed_rows =
             batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let mut loss = 0.0;
@@ -119,11 +125,10 @@ impl ActorRows<'_> {
     pub(super) fn differentiate(
         mut self,
         filter: Option<QFilter<'_>>,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
+        pass: Pass<'_>,
         scratch: &mut Scratch,
     ) {
+        let Pass { config, settings, actor, critic } = pass;
         let BatchRows { n_rows, inputs, .. } = self.batch;
         let n_input = actor.shape.n_input;
         let (n_state_action, n_heads) = (critic.shape.n_input, critic.shape.n_output);
@@ -162,15 +167,15 @@ impl ActorRows<'_> {
             n_input..n_state_action,
             self.action_gradient,
         );
-        self.add_action_terms(config, n_input);
+        self.add_action_terms(config, settings.bc_weight, n_input);
         self.activations.backward(&actor.shape, &actor.online, self.action_gradient);
     }
 
     /// Adds the gradient of the terms of the loss that depend on the action directly, and propagates the gradient back
     /// through the tanh.
-    fn add_action_terms(&mut self, config: &DdpgConfig, n_input: usize) {
+    fn add_action_terms(&mut self, config: &DdpgConfig, bc_weight: f32, n_input: usize) {
         let n_action = self.action_gradient.len() / self.batch.n_rows;
-        let terms = ActionTerms::new(config, n_action);
+        let terms = ActionTerms::new(config, bc_weight, n_action);
         let executed_rows =
             self.batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let rows = self
@@ -227,10 +232,10 @@ struct ActionTerms {
 }
 
 impl ActionTerms {
-    fn new(config: &DdpgConfig, n_action: usize) -> Self {
+    fn new(config: &DdpgConfig, bc_weight: f32, n_action: usize) -> Self {
         Self {
             penalty: config.action_penalty / (config.batch_size * n_action) as f32,
-            cloning: config.bc_weight / config.batch_size as f32,
+            cloning: bc_weight / config.batch_size as f32,
         }
     }
 

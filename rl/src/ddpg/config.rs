@@ -81,6 +81,21 @@ impl Default for DdpgConfig {
     }
 }
 
+/// The settings of an update that can change during a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpdateSettings {
+    /// Discount per control step, in [0, 1).
+    pub discount: f32,
+    /// Weight of behaviour cloning in the actor's loss, 0 or more.
+    pub bc_weight: f32,
+    /// Whether advice is cloned only where the critic values it above the actor's own action.
+    pub filters_advice: bool,
+    /// Adam's step size for the actor.
+    pub actor_learning_rate: f32,
+    /// Adam's step size for the critic.
+    pub critic_learning_rate: f32,
+}
+
 const fn one_batch() -> usize {
     1
 }
@@ -99,6 +114,19 @@ impl DdpgConfig {
     #[must_use]
     pub const fn transitions_per_update(&self) -> usize {
         self.batch_size * self.batches_per_update
+    }
+
+    /// Returns the settings of an update without schedules: the initial discount, the whole weight of behaviour cloning,
+    /// no filter of advice and the usual learning rates.
+    #[must_use]
+    pub const fn without_schedules(&self) -> UpdateSettings {
+        UpdateSettings {
+            discount: self.discount,
+            bc_weight: self.bc_weight,
+            filters_advice: false,
+            actor_learning_rate: self.actor_learning_rate,
+            critic_learning_rate: self.critic_learning_rate,
+        }
     }
 
     /// Checks every range; NaN is in none.

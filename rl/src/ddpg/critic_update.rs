@@ -4,9 +4,10 @@ use std::ops::Range;
 
 use tandem_policy::{Activations, Matrix, MatrixMut, MlpShape, RowBlock};
 
-use super::network::{Network, ParameterGradientInputs};
+use super::network::ParameterGradientInputs;
 use super::{
-    Batch, BatchRows, DdpgConfig, Scratch, Sizes, action_columns, split_rows, squash, write_columns,
+    Batch, BatchRows, DdpgConfig, Pass, Scratch, Sizes, action_columns, split_rows, squash,
+    write_columns,
 };
 
 /// The critic's part of an update: its batch, values and gradients.
@@ -109,13 +110,8 @@ impl CriticUpdate {
 impl<'a> CriticRows<'a> {
     /// Computes the values, their targets and the gradients of the critic's loss with respect to all activations.
     /// Returns the values of the executed actions, shape `[n_rows, n_heads]`.
-    pub(super) fn differentiate(
-        mut self,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
-        scratch: &mut Scratch,
-    ) -> &'a [f32] {
+    pub(super) fn differentiate(mut self, pass: Pass<'_>, scratch: &mut Scratch) -> &'a [f32] {
+        let Pass { config, settings, actor, critic } = pass;
         let BatchRows { n_rows, inputs, actions, rewards, next_inputs, .. } = self.batch;
         let (n_input, n_action) = (actor.shape.n_input, actor.shape.n_output);
         let (n_state_action, n_heads) = (critic.shape.n_input, critic.shape.n_output);
@@ -141,7 +137,7 @@ impl<'a> CriticRows<'a> {
             &mut MatrixMut::new(self.targets, n_rows, n_heads),
         );
         for (target, reward) in self.targets.iter_mut().zip(rewards) {
-            *target = critic_target(config.discount, self.lowest_reward, *reward, *target);
+            *target = critic_target(settings.discount, self.lowest_reward, *reward, *target);
         }
 
         // Q(s, a)
