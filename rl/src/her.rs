@@ -14,11 +14,13 @@ use crate::ddpg::Batch;
 use crate::replay::ReplayBuffer;
 
 mod config;
+mod hindsight;
 mod separation;
 #[cfg(test)]
 mod tests;
 
 pub use config::{ReplayConfig, RewardKind};
+pub(crate) use hindsight::relabelled_goal;
 
 /// The statistics with which a batch is normalised.
 #[derive(Debug, Clone, Copy)]
@@ -229,10 +231,10 @@ impl Sampler {
         let shared = self
             .layout
             .shares_object()
-            .then(|| self.hindsight_step(self.sample.steps[0], buffer, rng));
+            .then(|| self.sample_later_step(self.sample.steps[0], buffer, rng));
         for arm in self.layout.arms() {
             let later_step = shared
-                .unwrap_or_else(|| self.hindsight_step(self.sample.steps[arm.0], buffer, rng));
+                .unwrap_or_else(|| self.sample_later_step(self.sample.steps[arm.0], buffer, rng));
             self.sample.keeps_goal[arm.0] = later_step.is_none();
             self.take_goal(buffer, arm, later_step);
             if arm.0 == 0 {
@@ -253,7 +255,7 @@ impl Sampler {
     }
 
     fn relabel_jointly(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
-        let later_step = self.hindsight_step(self.sample.steps[0], buffer, rng);
+        let later_step = self.sample_later_step(self.sample.steps[0], buffer, rng);
         self.sample.keeps_goal.fill(later_step.is_none());
         self.take_common_goal(buffer, later_step);
         let norm = self.layout.norm();
@@ -314,20 +316,15 @@ impl Sampler {
         self.layout.norm().accumulate(&achieved, &goal.of(&self.sample.goal))
     }
 
-    /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the
-    /// desired goal.
-    fn hindsight_step(
+    /// Samples the later step whose achieved goal replaces the desired one; `None` keeps the desired goal.
+    fn sample_later_step(
         &self,
         StepIndex { episode_idx, step_idx }: StepIndex,
         buffer: &ReplayBuffer,
         rng: &mut ChaCha8Rng,
     ) -> Option<usize> {
-        let hindsight = bernoulli(rng, self.config.her_ratio);
-        let later_step = step_idx + 1 + index(rng, self.layout.episode_steps() - step_idx);
         let observation = |step_idx| buffer.observation(episode_idx, step_idx);
-        let is_goal = !self.config.displaced_hindsight
-            || self.layout.is_displaced(observation(0), observation(later_step));
-        (hindsight && is_goal).then_some(later_step)
+        hindsight::sample_later_step(&self.config, &self.layout, observation, step_idx, rng)
     }
 
     fn take_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {
@@ -353,7 +350,7 @@ impl Sampler {
         let (normalized_observation, normalized_goal) =
             input.split_at_mut(self.layout.n_observation());
         let layout = &self.layout;
-        for (to, from) in layout.arms().zip(self.sources()) {
+        for (to, from) in arm_sources(layout.n_arms(), self.sample.swapped) {
             let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let observation = buffer.observation(episode_idx, step_idx + later);
             if self.sample.reflected {
@@ -377,7 +374,7 @@ impl Sampler {
     }
 
     fn write_action(&self, buffer: &ReplayBuffer, actions: &mut [f32], bc_mask: &mut [f32]) {
-        for (to, from) in self.layout.arms().zip(self.sources()) {
+        for (to, from) in arm_sources(self.layout.n_arms(), self.sample.swapped) {
             let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
             let action = buffer.action(episode_idx, step_idx);
             if self.sample.reflected {
@@ -400,12 +397,17 @@ impl Sampler {
         let end = (step_idx + n_steps).min(self.layout.episode_steps());
         buffer.has_contact_of(arm, step_idx..end, episode_idx)
     }
+}
 
-    /// Returns the arm whose data fills each place: the arms in order, or in reverse if they are swapped.
-    fn sources(&self) -> impl Iterator<Item = ArmIndex> + use<> {
-        let (n_arms, swapped) = (self.layout.n_arms(), self.sample.swapped);
-        (0..n_arms).map(move |arm| ArmIndex(if swapped { n_arms - 1 - arm } else { arm }))
-    }
+/// Returns each arm's place and the arm whose data fills it: the arms in order, or in reverse order if they are swapped.
+pub(crate) fn arm_sources(
+    n_arms: usize,
+    swapped: bool,
+) -> impl Iterator<Item = (ArmIndex, ArmIndex)> {
+    (0..n_arms).map(move |place| {
+        let source = if swapped { n_arms - 1 - place } else { place };
+        (ArmIndex(place), ArmIndex(source))
+    })
 }
 
 /// Writes the part of a stored episode's goal, or what it achieved of it before `later_step`, into `goal`.
