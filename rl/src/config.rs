@@ -23,7 +23,7 @@ mod schedule;
 mod tests;
 
 pub use checks::is_name;
-pub use recipe::Recipe;
+pub use recipe::{Recipe, UnknownRecipe};
 pub use schedule::RoundSettings;
 
 /// The most episodes of an evaluation's slot.

@@ -18,6 +18,16 @@ fn every_recipe_passes_its_own_checks() {
 }
 
 #[test]
+fn a_recipe_parses_from_the_name_that_files_have() {
+    for recipe in Recipe::ALL {
+        assert_eq!(serde_json::to_value(recipe).unwrap(), recipe.name());
+        assert_eq!(recipe.to_string().parse(), Ok(recipe));
+    }
+    let message = "baselines".parse::<Recipe>().unwrap_err().to_string();
+    assert_eq!(message, "recipe is \"baselines\": expected \"tandem\" or \"paper\"");
+}
+
+#[test]
 fn the_papers_round_has_forty_updates() {
     let paper = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
     assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
