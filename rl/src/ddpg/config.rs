@@ -134,12 +134,8 @@ impl DdpgConfig {
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        for (key, discount) in
-            [("ddpg.discount", self.discount), ("ddpg.final_discount", self.final_discount)]
-        {
-            let is_discount = (0.0..1.0).contains(&discount);
-            OutOfRange::unless(is_discount, key, discount, "a number in [0, 1)")?;
-        }
+        OutOfRange::check_below_one("ddpg.discount", self.discount)?;
+        OutOfRange::check_below_one("ddpg.final_discount", self.final_discount)?;
         for (key, weight) in
             [("ddpg.action_penalty", self.action_penalty), ("ddpg.bc_weight", self.bc_weight)]
         {
@@ -152,8 +148,7 @@ impl DdpgConfig {
             ("ddpg.bc_final_fraction", self.bc_final_fraction),
             ("ddpg.bc_filter_start", self.bc_filter_start),
         ] {
-            let is_fraction = (0.0..=1.0).contains(&fraction);
-            OutOfRange::unless(is_fraction, key, fraction, "a number in [0, 1]")?;
+            OutOfRange::check_fraction(key, fraction)?;
         }
         for (key, rate) in [
             ("ddpg.cooldown_learning_rate", self.cooldown_learning_rate),
@@ -162,13 +157,13 @@ impl DdpgConfig {
         ] {
             OutOfRange::unless((1e-8..=1.0).contains(&rate), key, rate, "1e-8 to 1")?;
         }
-        for (key, size, most, expected) in [
-            ("ddpg.batch_size", self.batch_size, MAX_TRANSITIONS, "1 to 65,536"),
-            ("ddpg.batches_per_update", self.batches_per_update, 64, "1 to 64"),
-            ("ddpg.n_hidden", self.n_hidden, 4096, "1 to 4,096"),
-            ("ddpg.n_hidden_layers", self.n_hidden_layers, 16, "1 to 16"),
+        for (key, size, most) in [
+            ("ddpg.batch_size", self.batch_size, MAX_TRANSITIONS),
+            ("ddpg.batches_per_update", self.batches_per_update, 64),
+            ("ddpg.n_hidden", self.n_hidden, 4096),
+            ("ddpg.n_hidden_layers", self.n_hidden_layers, 16),
         ] {
-            OutOfRange::unless((1..=most).contains(&size), key, size, expected)?;
+            OutOfRange::check_range(key, size, 1..=most)?;
         }
         let most = MAX_TRANSITIONS / self.batch_size;
         let (key, n_batches) = ("ddpg.batches_per_update", self.batches_per_update);
