@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::episode::EpisodeKind;
 
-/// Section `[exploration]`: how training episodes explore.
+/// Section `[exploration]`: exploration in training episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Exploration {
@@ -31,7 +31,7 @@ pub struct Exploration {
 }
 
 impl Exploration {
-    /// The policy's actions as they are.
+    /// No exploration: the policy's actions are executed unchanged.
     pub const NONE: Self = Self {
         noise_std: 0.0,
         random_action_prob: 0.0,
@@ -54,12 +54,12 @@ impl Exploration {
     }
 }
 
-/// How workers ask for advice: two settings of section `[advice]`.
+/// Terms on which workers ask for advice: two settings of section `[advice]`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct AdviceTerms {
     /// The action of the student that the teacher judges.
     pub judged_action: JudgedAction,
-    /// What a unit of the budget pays for.
+    /// The steps that a unit of the budget pays for.
     pub unit: AdviceUnit,
 }
 
@@ -74,7 +74,7 @@ pub enum JudgedAction {
     Policy,
 }
 
-/// What a unit of the advice budget pays for.
+/// The steps that a unit of the advice budget pays for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AdviceUnit {
@@ -85,8 +85,8 @@ pub enum AdviceUnit {
     SlotStep,
 }
 
-/// Section `[world]`: how training episodes start, and how finely all episodes are simulated. The default is how
-/// policies are evaluated.
+/// Section `[world]`: starts of training episodes, and the resolution of the simulation. The default is the setting in
+/// which policies are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorldSettings {
@@ -99,8 +99,9 @@ pub struct WorldSettings {
     /// classic world, and a quarter of it in the other ones. The test at the end of a run, `tandem eval` and films use
     /// 20.
     pub substeps: u32,
-    /// How much the world varies between training episodes, in [0, 1]: size, mass and friction of the objects, delay of
-    /// the actions and noise of the observations. 0 is not at all, 1 is the full ranges. Former files have 0.
+    /// Extent to which the world varies between training episodes, in [0, 1]: size, mass and friction of the objects,
+    /// delay of the actions and noise of the observations. 0 disables it, 1 uses the full ranges. Files of earlier
+    /// versions have 0.
     #[serde(default)]
     pub randomization: f32,
 }

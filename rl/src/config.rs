@@ -60,11 +60,11 @@ pub struct RunConfig {
     pub replay: ReplayConfig,
     /// The update.
     pub ddpg: DdpgConfig,
-    /// When and on which goals the policy is evaluated.
+    /// Times and goals of the policy's evaluations.
     pub evaluation: EvaluationConfig,
-    /// When the run ends.
+    /// Limits of the run.
     pub stop: StopConfig,
-    /// When the learning state is saved.
+    /// Times at which the learning state is saved.
     pub checkpoint: CheckpointConfig,
     /// The task, unless it is built-in: a section of the run file, or the path of a TOML file with its fields, relative
     /// to the run file.
@@ -99,8 +99,8 @@ pub struct AdviceConfig {
     /// added up to one: slots differ in their seeds only and spend alike.
     #[serde(default)]
     pub budget_scope: BudgetScope,
-    /// What a unit pays for: one step of one episode (`env-step`), or the simultaneous steps of all advised episodes of
-    /// a slot (`slot-step`).
+    /// The steps that a unit pays for: one step of one episode (`env-step`), or the simultaneous steps of all advised
+    /// episodes of a slot (`slot-step`).
     #[serde(default)]
     pub unit: AdviceUnit,
     /// The action that the teacher judges: the one to be executed, exploration included (`executed`), or the policy's
@@ -215,7 +215,7 @@ const fn cycles_per_epoch() -> u64 {
     50
 }
 
-/// When the target networks are averaged.
+/// Frequency of Polyak averaging.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PolyakEvery {

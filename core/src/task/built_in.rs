@@ -137,7 +137,7 @@ impl Layout {
         }
     }
 
-    /// When `arm` holds its handle, and when the bar is level.
+    /// Returns the conditions under which `arm` holds its handle and the bar is level.
     fn carries(self, arm: ArmIndex) -> ArmManipulation {
         let first = self.observation_of(arm).start;
         let numbers = |range: Range<usize>| range.map(|idx| first + idx).collect::<Vec<usize>>();

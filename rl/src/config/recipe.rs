@@ -183,18 +183,18 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
     }
 }
 
-/// Returns whether the task is a built-in one of the world `shared`.
+/// Returns true if the task is a built-in one of the world `shared`.
 fn is_shared(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
 }
 
-/// Returns whether arms carry objects through an area that they share, each its own. An arm whose way is blocked then
+/// Returns true if arms carry objects through an area that they share, each its own. An arm whose way is blocked then
 /// has to wait until the other has made room (decisions 041 and 042).
 fn carries_past_others(layout: &TaskSpec) -> bool {
     is_shared(layout) && grasps(layout) && layout.n_arms() > 1
 }
 
-/// Returns whether the task is a built-in one in which arms grasp objects.
+/// Returns true if the task is a built-in one in which arms grasp objects.
 fn grasps(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.grasps())
 }

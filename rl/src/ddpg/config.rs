@@ -30,7 +30,7 @@ pub struct DdpgConfig {
     pub bc_final_fraction: f32,
     /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's
     /// own action, in [0, 1]: the Q-filter of Nair et al. 2018. With a value per arm, the advice to an arm
-    /// is compared by the arm's own value. 1 is never; a run without that limit never filters.
+    /// is compared by the arm's own value. 1 disables the filter, as does a run without that limit.
     #[serde(default = "never")]
     pub bc_filter_start: f32,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It
