@@ -320,7 +320,8 @@ impl Sampler {
     }
 }
 
-/// Returns each arm's place and the arm whose data fills it: the arms in order, or in reverse order if they are swapped.
+/// Returns each arm's place and the arm whose data fills it: the arms in order, or in reverse order if they are
+/// swapped.
 pub(crate) fn arm_sources(
     n_arms: usize,
     swapped: bool,

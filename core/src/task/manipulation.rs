@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use super::Norm;
 
-/// Manipulation of objects by the arms of a task. The default is that of tasks in which each arm has an object of its own,
-/// and in which an episode succeeds if its last step achieves the goal.
+/// Manipulation of objects by the arms of a task. The default is that of tasks in which each arm has an object of its
+/// own, and in which an episode succeeds if its last step achieves the goal.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Manipulation {

@@ -116,8 +116,8 @@ impl DdpgConfig {
         self.batch_size * self.batches_per_update
     }
 
-    /// Returns the settings of an update without schedules: the initial discount, the whole weight of behaviour cloning,
-    /// no filter of advice and the usual learning rates.
+    /// Returns the settings of an update without schedules: the initial discount, the whole weight of behaviour
+    /// cloning, no filter of advice and the usual learning rates.
     #[must_use]
     pub const fn without_schedules(&self) -> UpdateSettings {
         UpdateSettings {
