@@ -6,7 +6,7 @@ use anyhow::{Context as _, anyhow, bail};
 use tandem_core::settings::OutOfRange;
 use tandem_core::{Task, TaskDescription, TaskSpec};
 use tandem_rl::RunConfig;
-use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, former_keys};
+use tandem_rl::config::{ConfigError, INIT_TEACHER, Recipe, UnknownRecipe, former_keys};
 use tandem_system::atomic_file;
 use tandem_teacher::{Strategy, UnknownStrategy};
 use toml::{Table, Value};
@@ -218,10 +218,9 @@ fn blame(defaults: &Table, changes: &Table, error: &toml::de::Error) -> anyhow::
 /// Returns the recipe's values for the task and the number of arms that `changes` select.
 fn defaults_for(changes: &Table) -> anyhow::Result<RunConfig> {
     let recipe = match changes.get("recipe").and_then(Value::as_str) {
-        None | Some("tandem") => Recipe::Tandem,
-        Some("paper") => Recipe::Paper,
-        Some(other) => {
-            bail!("recipe is {:?}: expected \"tandem\" or \"paper\"", shortened(other))
+        None => Recipe::Tandem,
+        Some(name) => {
+            name.parse::<Recipe>().map_err(|UnknownRecipe(name)| UnknownRecipe(shortened(&name)))?
         }
     };
     let defaults = RunConfig::defaults_of(recipe, &task_for(changes)?);

@@ -103,7 +103,7 @@ pub fn update(clock: &Clock) -> Vec<Figure> {
         let mut ddpg = Ddpg::new(config.clone(), layout, Rewards::sparse(layout.n_arms), 1);
         ddpg.set_threads(n_threads);
         rate(clock, || {
-            drop(ddpg.update(&batch));
+            drop(ddpg.update(config.without_schedules(), &batch));
             ddpg.polyak();
         })
     };

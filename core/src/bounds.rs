@@ -5,6 +5,13 @@
 //! that can happen in an episode, such as an object that falls off the table in the 2 s of the classic world. In the
 //! shared world objects fall to a floor.
 
+use std::ops::Range;
+
+use crate::layout::observation::{
+    FINGER_OPENINGS, FINGER_RATES, HAND_POSITION, HAND_TO_OBJECT, HAND_VELOCITY,
+    OBJECT_ANGULAR_VELOCITY, OBJECT_ORIENTATION, OBJECT_POSITION, OBJECT_VELOCITY,
+    PER_CONTROL_STEP,
+};
 use crate::layout::{Layout, OBSERVATION_PER_ARM, World};
 
 /// Bound on the magnitude of any number in any observation or goal. It applies to students of unknown origin.
@@ -27,32 +34,30 @@ const SPIN: f32 = 30.0;
 
 /// The bounds of one arm's observation, in its order, for the tasks with an object on a table.
 const TABLE_TOP: [f32; OBSERVATION_PER_ARM] = {
-    let parts = [
-        (0, 3, REACH_M),
-        (3, 9, FALL_M),
-        (9, 12, OPENING_M),
-        (12, 16, UNIT),
-        (16, 19, SPEED),
-        (19, 22, SPIN),
-        (22, 25, SPEED),
-        (25, 28, OPENING_M),
+    let quantities: [(Range<usize>, f32); 9] = [
+        (HAND_POSITION, REACH_M),
+        (OBJECT_POSITION, FALL_M),
+        (HAND_TO_OBJECT, FALL_M),
+        (FINGER_OPENINGS, OPENING_M),
+        (OBJECT_ORIENTATION, UNIT),
+        (OBJECT_VELOCITY, SPEED),
+        (OBJECT_ANGULAR_VELOCITY, SPIN),
+        (HAND_VELOCITY, SPEED),
+        (FINGER_RATES, OPENING_M),
     ];
     let mut bounds = [0.0; OBSERVATION_PER_ARM];
-    let mut part_idx = 0;
-    while part_idx < parts.len() {
-        let (start, end, bound) = parts[part_idx];
-        let mut idx = start;
-        while idx < end {
-            bounds[idx] = bound;
+    let mut quantity_idx = 0;
+    while quantity_idx < quantities.len() {
+        let (range, bound) = &quantities[quantity_idx];
+        let mut idx = range.start;
+        while idx < range.end {
+            bounds[idx] = *bound;
             idx += 1;
         }
-        part_idx += 1;
+        quantity_idx += 1;
     }
     bounds
 };
-
-/// Velocities within an arm's part of an observation. They are per control step, whose duration depends on the world.
-const PER_STEP: std::ops::Range<usize> = 16..OBSERVATION_PER_ARM;
 
 impl Layout {
     /// Returns the largest magnitude that number `idx` of an observation can have, in the number's own unit (see
@@ -60,7 +65,7 @@ impl Layout {
     #[must_use]
     pub const fn observation_bound(self, idx: usize) -> f32 {
         let part_idx = idx % OBSERVATION_PER_ARM;
-        let is_per_step = PER_STEP.start <= part_idx && part_idx < PER_STEP.end;
+        let is_per_step = PER_CONTROL_STEP.start <= part_idx && part_idx < PER_CONTROL_STEP.end;
         // An arm's numbers have the bounds of its own task, which a teacher for that task expects.
         let world = self.task.of_one_arm().world();
         let steps = world.control_step_s() / World::Classic.control_step_s();
@@ -77,7 +82,7 @@ impl Layout {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::{HAND_POSITION, OBJECT_POSITION, Task};
+    use crate::layout::Task;
 
     #[test]
     fn every_number_of_every_arm_has_the_bound_of_its_quantity() {

@@ -6,15 +6,15 @@ use std::fmt;
 use std::ops::Range;
 use std::str::FromStr;
 
-/// Length of one arm's part of an observation (section 4.1 and Table 1 of the paper). `tandem_sim::Env::observe` lists
-/// the numbers.
+pub mod observation;
+
+pub use observation::{HAND_POSITION, OBJECT_POSITION};
+
+/// Length of one arm's part of an observation (section 4.1 and Table 1 of the paper); [`observation`] has its
+/// quantities.
 pub const OBSERVATION_PER_ARM: usize = 28;
 /// Length of one arm's part of a goal: the desired position (x, y, z) of its object, arm frame, metres.
 pub const GOAL_PER_ARM: usize = 3;
-/// Range of the end effector's position (x, y, z; arm frame, metres) within its arm's part of an observation.
-pub const HAND_POSITION: Range<usize> = 0..3;
-/// Range of the object's position (x, y, z; arm frame, metres) within its arm's part of an observation.
-pub const OBJECT_POSITION: Range<usize> = 3..6;
 /// Distance between the origins of the frames of two arms, metres. In the classic world these are the centres of their
 /// workspaces.
 ///

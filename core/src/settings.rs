@@ -6,13 +6,14 @@
 //! in `sim`.
 
 use std::fmt::Display;
+use std::ops::RangeInclusive;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::episode::EpisodeKind;
 
-/// Section `[exploration]`: how training episodes explore.
+/// Section `[exploration]`: exploration in training episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Exploration {
@@ -30,7 +31,7 @@ pub struct Exploration {
 }
 
 impl Exploration {
-    /// The policy's actions as they are.
+    /// No exploration: the policy's actions are executed unchanged.
     pub const NONE: Self = Self {
         noise_std: 0.0,
         random_action_prob: 0.0,
@@ -44,11 +45,8 @@ impl Exploration {
     /// Names the first setting that is out of its range.
     pub fn check(&self, episode_steps: usize) -> Result<(), OutOfRange> {
         let Self { noise_std, random_action_prob, sticky_random_mean_steps, .. } = *self;
-        let is_noise = (0.0..=10.0).contains(&noise_std);
-        OutOfRange::unless(is_noise, "exploration.noise_std", noise_std, "0 to 10")?;
-        let is_prob = (0.0..1.0).contains(&random_action_prob);
-        let key = "exploration.random_action_prob";
-        OutOfRange::unless(is_prob, key, random_action_prob, "a number in [0, 1)")?;
+        OutOfRange::check_range("exploration.noise_std", noise_std, 0.0..=10.0)?;
+        OutOfRange::check_below_one("exploration.random_action_prob", random_action_prob)?;
         let is_mean = (1.0..=episode_steps as f64).contains(&f64::from(sticky_random_mean_steps));
         let key = "exploration.sticky_random_mean_steps";
         let expected = format_args!("1 to {episode_steps}, the steps of an episode").to_string();
@@ -56,12 +54,12 @@ impl Exploration {
     }
 }
 
-/// How workers ask for advice: two settings of section `[advice]`.
+/// Terms on which workers ask for advice: two settings of section `[advice]`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct AdviceTerms {
     /// The action of the student that the teacher judges.
     pub judged_action: JudgedAction,
-    /// What a unit of the budget pays for.
+    /// The steps that a unit of the budget pays for.
     pub unit: AdviceUnit,
 }
 
@@ -76,7 +74,7 @@ pub enum JudgedAction {
     Policy,
 }
 
-/// What a unit of the advice budget pays for.
+/// The steps that a unit of the advice budget pays for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AdviceUnit {
@@ -87,8 +85,8 @@ pub enum AdviceUnit {
     SlotStep,
 }
 
-/// Section `[world]`: how training episodes start, and how finely all episodes are simulated. The default is how
-/// policies are evaluated.
+/// Section `[world]`: starts of training episodes, and the resolution of the simulation. The default is the setting in
+/// which policies are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize, JsonSchema, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorldSettings {
@@ -101,8 +99,9 @@ pub struct WorldSettings {
     /// classic world, and a quarter of it in the other ones. The test at the end of a run, `tandem eval` and films use
     /// 20.
     pub substeps: u32,
-    /// How much the world varies between training episodes, in [0, 1]: size, mass and friction of the objects, delay of
-    /// the actions and noise of the observations. 0 is not at all, 1 is the full ranges. Former files have 0.
+    /// Extent to which the world varies between training episodes, in [0, 1]: size, mass and friction of the objects,
+    /// delay of the actions and noise of the observations. 0 disables it, 1 uses the full ranges. Files of earlier
+    /// versions have 0.
     #[serde(default)]
     pub randomization: f32,
 }
@@ -131,12 +130,8 @@ impl WorldSettings {
     pub fn check(&self) -> Result<(), OutOfRange> {
         let Self { grasped_start_prob, grasped_start_env_steps: _, substeps, randomization } =
             *self;
-        let is_share = (0.0..=1.0).contains(&randomization);
-        let key = "world.randomization";
-        OutOfRange::unless(is_share, key, randomization, "a number in [0, 1]")?;
-        let is_prob = (0.0..=1.0).contains(&grasped_start_prob);
-        let key = "world.grasped_start_prob";
-        OutOfRange::unless(is_prob, key, grasped_start_prob, "a number in [0, 1]")?;
+        OutOfRange::check_fraction("world.randomization", randomization)?;
+        OutOfRange::check_fraction("world.grasped_start_prob", grasped_start_prob)?;
         OutOfRange::unless(matches!(substeps, 10 | 20), "world.substeps", substeps, "10 or 20")
     }
 
@@ -233,6 +228,61 @@ impl OutOfRange {
             false => Err(Self { key, value: value.to_string(), expected: expected.to_string() }),
         }
     }
+
+    /// Checks that the value of the setting `key` is in `range`; NaN is not.
+    ///
+    /// # Errors
+    /// Returns an error that names the range as, for example, `1 to 100,000`.
+    pub fn check_range<T: PartialOrd + Display + Copy>(
+        key: &'static str,
+        value: T,
+        range: RangeInclusive<T>,
+    ) -> Result<(), Self> {
+        if range.contains(&value) {
+            return Ok(());
+        }
+        let [low, high] = [range.start(), range.end()].map(|bound| grouped(&bound.to_string()));
+        Self::unless(false, key, value, format_args!("{low} to {high}"))
+    }
+
+    /// Checks that the value of the setting `key` is in [0, 1]; NaN is not.
+    ///
+    /// # Errors
+    /// Returns an error about any other value.
+    pub fn check_fraction(
+        key: &'static str,
+        value: impl Into<f64> + Display + Copy,
+    ) -> Result<(), Self> {
+        let number: f64 = value.into();
+        Self::unless((0.0..=1.0).contains(&number), key, value, "a number in [0, 1]")
+    }
+
+    /// Checks that the value of the setting `key` is in [0, 1); NaN is not.
+    ///
+    /// # Errors
+    /// Returns an error about any other value.
+    pub fn check_below_one(
+        key: &'static str,
+        value: impl Into<f64> + Display + Copy,
+    ) -> Result<(), Self> {
+        let number: f64 = value.into();
+        Self::unless((0.0..1.0).contains(&number), key, value, "a number in [0, 1)")
+    }
+}
+
+/// Separates the thousands of a whole number with commas. Any other text is returned unchanged.
+fn grouped(number: &str) -> String {
+    if !number.bytes().all(|byte| byte.is_ascii_digit()) {
+        return number.to_owned();
+    }
+    let mut grouped = String::new();
+    for (idx, digit) in number.chars().enumerate() {
+        if idx > 0 && (number.len() - idx).is_multiple_of(3) {
+            grouped.push(',');
+        }
+        grouped.push(digit);
+    }
+    grouped
 }
 
 #[cfg(test)]
@@ -294,5 +344,33 @@ mod tests {
             "exploration.sticky_random_mean_steps is 80: expected 1 to 50, the steps of an episode";
         assert_eq!((message.as_str(), sticky.check(100)), (expected, Ok(())));
         assert_eq!((Exploration::NONE.check(1), WORLD.check()), (Ok(()), Ok(())));
+    }
+
+    #[test]
+    fn a_range_includes_its_bounds_and_is_named_in_the_error() {
+        let expected = |checked: Result<(), OutOfRange>| checked.map_err(|error| error.expected);
+        for inside in [1, 65_536] {
+            assert_eq!(OutOfRange::check_range("key", inside, 1..=65_536), Ok(()));
+        }
+        for (range, named) in [
+            (1..=16, "1 to 16"),
+            (0..=999, "0 to 999"),
+            (1..=4096, "1 to 4,096"),
+            (1..=1_000_000, "1 to 1,000,000"),
+        ] {
+            let above = range.end() + 1;
+            assert_eq!(
+                expected(OutOfRange::check_range("key", above, range)),
+                Err(named.to_owned())
+            );
+        }
+        let tolerance = OutOfRange::check_range("key", f32::NAN, 1e-4..=1.0);
+        assert_eq!(expected(tolerance), Err("0.0001 to 1".to_owned()));
+        assert_eq!(OutOfRange::check_fraction("key", 1.0_f32), Ok(()));
+        let fraction = OutOfRange::check_fraction("key", f64::NAN);
+        assert_eq!(expected(fraction), Err("a number in [0, 1]".to_owned()));
+        assert_eq!(OutOfRange::check_below_one("key", 0.0_f32), Ok(()));
+        let below_one = OutOfRange::check_below_one("key", 1.0_f32);
+        assert_eq!(expected(below_one), Err("a number in [0, 1)".to_owned()));
     }
 }

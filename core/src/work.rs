@@ -13,7 +13,7 @@ pub struct RunTerms {
     pub layout: TaskSpec,
     /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
-    /// How the student asks for advice.
+    /// Terms on which the student asks for advice.
     pub advice: AdviceTerms,
     /// Exploration in training episodes.
     pub exploration: Exploration,
@@ -24,14 +24,14 @@ pub struct RunTerms {
     pub symmetrized_evaluation: bool,
 }
 
-/// How a training episode explores.
+/// Exploration of a training episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EpisodeExploration {
-    /// As the run's [`Exploration`] says.
+    /// Noise and random actions from the run's settings.
     Noise,
     /// All actions are uniformly random (warm-up).
     Uniform,
-    /// Not at all: the policy's actions are executed as they are.
+    /// None: executes the policy's actions unchanged.
     Greedy,
 }
 
@@ -44,16 +44,16 @@ pub struct EpisodeOrder {
     pub seed: u64,
     /// Whether to ask the teacher for advice.
     pub advised: bool,
-    /// How it explores, if it is played for training.
+    /// Exploration, if it is played for training.
     pub exploration: EpisodeExploration,
     /// Whether to record the episode in a log.
     pub record: bool,
-    /// The number of steps, from the first one on, on which an advised episode asks; `None` means all.
+    /// Number of initial steps on which an advised episode may ask; `None` means all.
     pub advised_steps: Option<u32>,
 }
 
 impl EpisodeOrder {
-    /// Returns true if the episode is to ask on step `step_idx`, from 0.
+    /// Returns true if the episode may ask on step `step_idx`, from 0.
     #[must_use]
     pub fn asks_on(&self, step_idx: usize) -> bool {
         let is_before_end = |n_steps| u32::try_from(step_idx).is_ok_and(|step| step < n_steps);
@@ -106,7 +106,7 @@ pub struct PublishedActor {
     pub goal_mean: Vec<f32>,
     /// Standard deviation of goals, above 0, shape `[n_goal]`.
     pub goal_std: Vec<f32>,
-    /// When to ask for advice; `None` means always.
+    /// The condition for asking for advice; `None` means always.
     pub gate: Option<PublishedGate>,
 }
 

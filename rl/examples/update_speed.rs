@@ -67,7 +67,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// Updates per second, by one update and Polyak step.
 fn sample_update(ddpg: &mut Ddpg, batch: &Batch) -> Result<f64, Box<dyn std::error::Error>> {
     let start = now();
-    ddpg.update(batch)?;
+    ddpg.update(ddpg.config().without_schedules(), batch)?;
     ddpg.polyak();
     Ok(1.0 / start.elapsed().as_secs_f64())
 }

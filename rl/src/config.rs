@@ -18,11 +18,13 @@ use crate::her::ReplayConfig;
 mod checks;
 pub mod former_keys;
 mod recipe;
+mod schedule;
 #[cfg(test)]
 mod tests;
 
 pub use checks::is_name;
-pub use recipe::Recipe;
+pub use recipe::{Recipe, UnknownRecipe};
+pub use schedule::RoundSettings;
 
 /// The most episodes of an evaluation's slot.
 pub(crate) const EVALUATION_SLOT_EPISODES: usize = 8;
@@ -58,11 +60,11 @@ pub struct RunConfig {
     pub replay: ReplayConfig,
     /// The update.
     pub ddpg: DdpgConfig,
-    /// When and on which goals the policy is evaluated.
+    /// Times and goals of the policy's evaluations.
     pub evaluation: EvaluationConfig,
-    /// When the run ends.
+    /// Limits of the run.
     pub stop: StopConfig,
-    /// When the learning state is saved.
+    /// Times at which the learning state is saved.
     pub checkpoint: CheckpointConfig,
     /// The task, unless it is built-in: a section of the run file, or the path of a TOML file with its fields, relative
     /// to the run file.
@@ -97,8 +99,8 @@ pub struct AdviceConfig {
     /// added up to one: slots differ in their seeds only and spend alike.
     #[serde(default)]
     pub budget_scope: BudgetScope,
-    /// What a unit pays for: one step of one episode (`env-step`), or the simultaneous steps of all advised episodes of
-    /// a slot (`slot-step`).
+    /// The steps that a unit pays for: one step of one episode (`env-step`), or the simultaneous steps of all advised
+    /// episodes of a slot (`slot-step`).
     #[serde(default)]
     pub unit: AdviceUnit,
     /// The action that the teacher judges: the one to be executed, exploration included (`executed`), or the policy's
@@ -213,7 +215,7 @@ const fn cycles_per_epoch() -> u64 {
     50
 }
 
-/// When the target networks are averaged.
+/// Frequency of Polyak averaging.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PolyakEvery {
@@ -358,15 +360,6 @@ impl RunConfig {
             .max(1)
     }
 
-    /// Returns true if round `round`, from 0, is in the last `ddpg.cooldown_share` of the run's environment steps. A
-    /// run without a limit in environment steps has no cooldown.
-    #[must_use]
-    pub fn is_cooldown(&self, round: u64) -> bool {
-        let max = self.stop.max_env_steps;
-        let first = (1.0 - f64::from(self.ddpg.cooldown_share)) * max as f64;
-        max > 0 && (round * self.env_steps_per_round()) as f64 >= first
-    }
-
     /// Returns true if the parameters after `round` rounds are evaluated: those of every
     /// [`rounds_per_evaluation`](Self::rounds_per_evaluation), and the early ones.
     #[must_use]
@@ -377,60 +370,6 @@ impl RunConfig {
         }
         let early = |point| u128::from(point) * u128::from(regular) / u128::from(n_early);
         (0..n_early).any(|point| early(point) == u128::from(round))
-    }
-
-    /// Returns the cost of a contact, in units of reward, in round `round`, from 0. It grows between a tenth and half
-    /// of the run.
-    #[must_use]
-    pub fn contact_cost(&self, round: u64) -> f32 {
-        let growth = self.replay.contact_cost_growth - 1.0;
-        self.replay.contact_cost * (1.0 + self.share_of_part(round, 0.1, 0.5) * growth)
-    }
-
-    /// Returns the discount per control step in round `round`, from 0. Its horizon `1 / (1 - discount)` grows between
-    /// one quarter and three quarters of the run.
-    #[must_use]
-    pub fn discount(&self, round: u64) -> f32 {
-        let share = self.share_of_part(round, 0.25, 0.75);
-        if self.ddpg.final_discount == 0.0 || share == 0.0 {
-            return self.ddpg.discount;
-        }
-        let horizon = |discount: f32| 1.0 / (1.0 - discount);
-        let (first, last) = (horizon(self.ddpg.discount), horizon(self.ddpg.final_discount));
-        1.0 - 1.0 / (first + share * (last - first))
-    }
-
-    /// Returns the fraction of the episodes without advice that round `round`, from 0, plays without exploration.
-    #[must_use]
-    pub fn greedy_share(&self, round: u64) -> f64 {
-        self.rounds.final_greedy_share * f64::from(self.share_of_part(round, 0.25, 0.75))
-    }
-
-    /// Returns the weight of behaviour cloning in round `round`, from 0.
-    #[must_use]
-    pub fn bc_weight(&self, round: u64) -> f32 {
-        let loss = 1.0 - self.ddpg.bc_final_fraction;
-        self.ddpg.bc_weight * (1.0 - self.share_of_part(round, 0.25, 0.75) * loss)
-    }
-
-    /// Returns true if advice is filtered before it is cloned in round `round`, from 0.
-    #[must_use]
-    pub fn filters_advice(&self, round: u64) -> bool {
-        let start = f64::from(self.ddpg.bc_filter_start) * self.stop.max_env_steps as f64;
-        let is_limited = self.stop.max_env_steps > 0 && self.ddpg.bc_filter_start < 1.0;
-        is_limited && (round * self.env_steps_per_round()) as f64 >= start
-    }
-
-    /// Returns how much of the part of the run from `start` to `end`, fractions of its environment steps, lies before
-    /// round `round`, in [0, 1]. It is 0 in a run without a limit in environment steps.
-    #[expect(clippy::cast_possible_truncation, reason = "a number in [0, 1]")]
-    fn share_of_part(&self, round: u64, start: f64, end: f64) -> f32 {
-        let max = self.stop.max_env_steps;
-        if max == 0 {
-            return 0.0;
-        }
-        let share = (round * self.env_steps_per_round()) as f64 / max as f64;
-        ((share - start) / (end - start)).clamp(0.0, 1.0) as f32
     }
 
     /// Returns the number of rounds between two evaluations, at least one.

@@ -2,8 +2,7 @@
 //!
 //! It has the steps of section 2.2 of the paper, with the target networks of section 4.2: the critic's target and loss
 //! (equation 5), the actor's loss (equation 4), a step of Adam for each, and Polyak averaging of the target networks.
-//! Both gradients are taken at the same parameters, so the critic's half and the actor's half of an update can run in
-//! parallel.
+//! Both gradients are taken at the same parameters, so the updates of critic and actor can run in parallel.
 //!
 //! An update has three steps, each of which waits for the one before: all passes over the rows of the batch, in blocks
 //! of rows; the gradients and Adam, in blocks of parameters; and the transposed weights for the next passes. The blocks
@@ -15,21 +14,21 @@ use std::ops::Range;
 use tandem_core::{Stream, TaskSpec, episode_rng};
 use tandem_policy::{Activations, MatrixMut, MlpShape, tanh};
 
-mod actor_half;
+mod actor_update;
 mod config;
-mod critic_half;
+mod critic_update;
 mod network;
 mod state;
 #[cfg(test)]
 mod tests;
 mod threads;
 
-use actor_half::{ActorHalf, ActorRows, QFilter};
-use critic_half::{CriticHalf, CriticRows};
+use actor_update::{ActorRows, ActorUpdate, QFilter};
+use critic_update::{CriticRows, CriticUpdate};
 use network::Network;
 use threads::{for_each, in_pool};
 
-pub use config::DdpgConfig;
+pub use config::{DdpgConfig, UpdateSettings};
 pub use state::CriticBatch;
 
 /// A batch of `b` transitions. An input is a normalised observation followed by a normalised goal.
@@ -137,19 +136,26 @@ pub enum DdpgError {
 #[derive(Debug, Clone)]
 pub struct Ddpg {
     config: DdpgConfig,
-    /// Whether advice is cloned only where the critic values it above the actor's own action.
-    filters_advice: bool,
     n_updates: u64,
     actor: Network,
     critic: Network,
-    actor_half: ActorHalf,
-    critic_half: CriticHalf,
+    actor_update: ActorUpdate,
+    critic_update: CriticUpdate,
     /// The critic's head that values each component of an action; `None` is the sum of all heads.
     heads: Vec<Option<usize>>,
     /// Blocks of rows of the passes.
     row_blocks: Vec<Range<usize>>,
     /// One for each thread.
     scratch: Vec<Scratch>,
+}
+
+/// The settings and networks of the passes of an update, which all rows share.
+#[derive(Debug, Clone, Copy)]
+struct Pass<'a> {
+    config: &'a DdpgConfig,
+    settings: UpdateSettings,
+    actor: &'a Network,
+    critic: &'a Network,
 }
 
 /// A thread's memory for the passes whose activations are not used after them.
@@ -178,12 +184,11 @@ impl Ddpg {
         let critic_shape = MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads);
         let row_blocks = critic_shape.row_blocks(config.transitions_per_update());
         let mut ddpg = Self {
-            filters_advice: false,
             n_updates: 0,
             actor: network(actor_shape, 0, config.actor_learning_rate),
             critic: network(critic_shape, 1, config.critic_learning_rate),
-            actor_half: ActorHalf::new(&config, &actor_shape, &critic_shape),
-            critic_half: CriticHalf::new(&config, rewards.lowest, &critic_shape),
+            actor_update: ActorUpdate::new(&config, &actor_shape, &critic_shape),
+            critic_update: CriticUpdate::new(&config, rewards.lowest, &critic_shape),
             heads: heads_of_actions(&layout, rewards.n_heads),
             row_blocks,
             scratch: Vec::new(),
@@ -194,23 +199,29 @@ impl Ddpg {
     }
 
     /// Makes one gradient step of critic and actor on `batch`, which holds the transitions of all batches of an update.
-    /// The gradients of the batches are summed.
+    /// The gradients of the batches are summed. `settings` are those of the present round.
     ///
     /// # Errors
     /// When a loss or a parameter is no longer finite. The networks are unusable then.
     ///
     /// # Panics
     /// When the batch does not have [`DdpgConfig::transitions_per_update`] rows, or another layout.
-    pub fn update(&mut self, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
+    pub fn update(
+        &mut self,
+        settings: UpdateSettings,
+        batch: &Batch,
+    ) -> Result<UpdateLosses, DdpgError> {
         self.check_size(batch);
+        self.actor.adam.set_learning_rate(settings.actor_learning_rate);
+        self.critic.adam.set_learning_rate(settings.critic_learning_rate);
         let n_threads = self.scratch.len();
         let finite = in_pool(n_threads, || {
-            self.pass_over_rows(batch);
+            self.pass_over_rows(settings, batch);
             self.step_parameters(batch)
         });
-        let Self { config, actor_half, critic_half, .. } = self;
-        let critic_loss = critic_half.loss(config.transitions_per_update());
-        let (actor_loss, mean_q) = actor_half.loss_and_mean_q(config, batch);
+        let Self { config, actor_update, critic_update, .. } = self;
+        let critic_loss = critic_update.loss(config.transitions_per_update());
+        let (actor_loss, mean_q) = actor_update.loss_and_mean_q(config, settings.bc_weight, batch);
         self.n_updates += 1;
         let checks = [
             ("a critic loss", critic_loss.is_finite()),
@@ -244,8 +255,9 @@ impl Ddpg {
         Sizes { n_input, n_action, n_heads: critic.shape.n_output }
     }
 
-    /// Makes all passes that are independent for each row: values, targets, and the gradients by all activations.
-    fn pass_over_rows(&mut self, batch: &Batch) {
+    /// Makes all passes that are independent for each row: values, targets, and the gradients with respect to all
+    /// activations.
+    fn pass_over_rows(&mut self, settings: UpdateSettings, batch: &Batch) {
         enum Rows<'a> {
             Critic(CriticRows<'a>),
             Actor(ActorRows<'a>),
@@ -253,40 +265,42 @@ impl Ddpg {
             Both(Box<(CriticRows<'a>, ActorRows<'a>)>),
         }
         let sizes = self.sizes();
-        let Self { config, actor, critic, actor_half, critic_half, heads, .. } = self;
-        let (config, actor, critic, heads) = (&*config, &*actor, &*critic, &**heads);
-        let critic_rows = critic_half.rows(batch, &self.row_blocks, sizes).into_iter();
-        let actor_rows = actor_half.rows(batch, &self.row_blocks, sizes).into_iter();
-        let tasks = if self.filters_advice && config.bc_weight > 0.0 {
+        let Self { config, actor, critic, actor_update, critic_update, heads, .. } = self;
+        let (pass, heads) = (Pass { config, settings, actor, critic }, &**heads);
+        let critic_rows = critic_update.rows(batch, &self.row_blocks, sizes).into_iter();
+        let actor_rows = actor_update.rows(batch, &self.row_blocks, sizes).into_iter();
+        let tasks = if settings.filters_advice && settings.bc_weight > 0.0 {
             critic_rows.zip(actor_rows).map(|rows| Rows::Both(Box::new(rows))).collect()
         } else {
             critic_rows.map(Rows::Critic).chain(actor_rows.map(Rows::Actor)).collect()
         };
         for_each(&mut self.scratch, tasks, |scratch, rows| match rows {
             Rows::Critic(rows) => {
-                rows.differentiate(config, actor, critic, scratch);
+                rows.differentiate(pass, scratch);
             }
-            Rows::Actor(rows) => rows.differentiate(None, config, actor, critic, scratch),
+            Rows::Actor(rows) => rows.differentiate(None, pass, scratch),
             Rows::Both(rows) => {
                 let (critic_rows, actor_rows) = *rows;
-                let executed_q = critic_rows.differentiate(config, actor, critic, scratch);
+                let executed_q = critic_rows.differentiate(pass, scratch);
                 let filter = QFilter { executed_q, heads };
-                actor_rows.differentiate(Some(filter), config, actor, critic, scratch);
+                actor_rows.differentiate(Some(filter), pass, scratch);
             }
         });
     }
 
-    /// Makes a step of Adam with the gradients by the parameters, and returns which parameters are finite.
+    /// Makes a step of Adam with the gradients with respect to the parameters, and returns which parameters are finite.
     fn step_parameters(&mut self, batch: &Batch) -> Finite {
         let b = self.config.transitions_per_update();
-        let Self { actor, critic, actor_half, critic_half, scratch, .. } = self;
-        let actor_gradient = actor_half.gradient(&actor.shape, batch, b);
-        let critic_gradient = critic_half.gradient(&critic.shape, b);
+        let Self { actor, critic, actor_update, critic_update, scratch, .. } = self;
+        let actor_gradient = actor_update.gradient_inputs(&actor.shape, batch, b);
+        let critic_gradient = critic_update.gradient_inputs(&critic.shape, b);
         let mut tasks = critic.step(&critic_gradient);
         tasks.extend(actor.step(&actor_gradient));
         for_each(scratch, tasks, |_, task| task.run());
-        let finite =
-            Finite { actor: actor_gradient.is_finite(), critic: critic_gradient.is_finite() };
+        let finite = Finite {
+            actor: actor_gradient.parameters_are_finite(),
+            critic: critic_gradient.parameters_are_finite(),
+        };
         let mut tasks = critic.transpose();
         tasks.extend(actor.transpose());
         for_each(scratch, tasks, |_, task| task.run());
@@ -300,29 +314,6 @@ impl Ddpg {
         let mut tasks = critic.polyak();
         tasks.extend(actor.polyak());
         in_pool(scratch.len(), || for_each(scratch, tasks, |_, task| task.run(keep)));
-    }
-
-    /// Switches between the usual learning rates and that of the cooldown.
-    pub fn set_cooldown(&mut self, is_cooldown: bool) {
-        let Self { config, actor, critic, .. } = self;
-        let rate = |usual| if is_cooldown { config.cooldown_learning_rate } else { usual };
-        actor.adam.set_learning_rate(rate(config.actor_learning_rate));
-        critic.adam.set_learning_rate(rate(config.critic_learning_rate));
-    }
-
-    /// Sets the discount per control step, in [0, 1), for the updates that follow.
-    pub const fn set_discount(&mut self, discount: f32) {
-        self.config.discount = discount;
-    }
-
-    /// Sets the weight of behaviour cloning, 0 or more, for the updates that follow.
-    pub const fn set_bc_weight(&mut self, weight: f32) {
-        self.config.bc_weight = weight;
-    }
-
-    /// Sets whether the updates that follow clone advice only where the critic values it above the actor's own action.
-    pub const fn set_bc_filter(&mut self, filters_advice: bool) {
-        self.filters_advice = filters_advice;
     }
 
     /// Sets how many threads of the rayon pool work on an update; 0 means 1. The results are the same, bit for bit.
@@ -403,10 +394,10 @@ fn write_columns(
 fn action_columns<'a>(
     input: &'a mut [f32],
     actor: &MlpShape,
-    n_joined: usize,
+    n_state_action: usize,
     n_rows: usize,
 ) -> MatrixMut<'a> {
-    MatrixMut::with_stride(&mut input[actor.n_input..], n_rows, actor.n_output, n_joined)
+    MatrixMut::with_stride(&mut input[actor.n_input..], n_rows, actor.n_output, n_state_action)
 }
 
 /// Applies tanh to every action.

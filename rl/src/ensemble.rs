@@ -1,5 +1,5 @@
-//! The ensemble of critics of strategy `ts2c:T`, whose disagreement says where the student does not know the value of
-//! its action (after TS2C, Xue et al. 2023).
+//! The ensemble of critics of strategy `ts2c:T`. Its disagreement marks the steps on which the value of the student's
+//! action is uncertain (after TS2C, Xue et al. 2023).
 //!
 //! The critics are small, differ in their initialisation, and learn the targets of the student's critic on the same
 //! batches. Where they have seen data they agree; elsewhere each extrapolates in its own way (Lakshminarayanan et al.
@@ -31,7 +31,7 @@ pub struct CriticEnsemble {
     workspace: Workspace,
     /// Values of a batch, shape `[b, n_heads]`.
     q: Vec<f32>,
-    /// The loss's gradient by `q`.
+    /// Gradient of the loss with respect to `q`.
     q_gradient: Vec<f32>,
     gradient: Vec<f32>,
 }

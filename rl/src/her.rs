@@ -7,18 +7,21 @@ use rand_chacha::ChaCha8Rng;
 use tandem_core::reward::{REWARD_ACHIEVED, sparse_reward_within};
 use tandem_core::rng::{bernoulli, index};
 use tandem_core::task::Part;
-use tandem_core::{ArmIndex, Contacts, TaskSpec};
+use tandem_core::{ArmIndex, TaskSpec};
 use tandem_policy::NormalizerSnapshot;
 
 use crate::ddpg::Batch;
 use crate::replay::ReplayBuffer;
 
 mod config;
+mod hindsight;
+mod rows;
 mod separation;
 #[cfg(test)]
 mod tests;
 
 pub use config::{ReplayConfig, RewardKind};
+pub(crate) use hindsight::relabelled_goal;
 
 /// The statistics with which a batch is normalised.
 #[derive(Debug, Clone, Copy)]
@@ -36,9 +39,9 @@ struct StepIndex {
     step_idx: usize,
 }
 
-/// A sampled transition with its goal.
+/// A sampled transition: steps of stored episodes, with a goal and rewards of its own.
 #[derive(Debug, Clone, PartialEq)]
-struct Relabelled {
+struct SampledTransition {
     /// The step of each arm's part.
     steps: Vec<StepIndex>,
     goal: Vec<f32>,
@@ -47,8 +50,8 @@ struct Relabelled {
     keeps_goal: Vec<bool>,
     swapped: bool,
     reflected: bool,
-    /// Whether the hands are in contact, because the arms' steps are those of different episodes.
-    touches: bool,
+    /// Whether the hands are in contact because the arms' steps, of different episodes, are combined.
+    has_contact: bool,
 }
 
 /// Samples batches from a replay buffer.
@@ -58,10 +61,11 @@ pub struct Sampler {
     layout: TaskSpec,
     contact_cost: f32,
     intervention_cost: f32,
-    /// The transition that is being sampled, or written.
-    sample: Relabelled,
-    /// Those of a batch.
-    samples: Vec<Relabelled>,
+    /// The transition that is being sampled or written. It trades places with an element of `samples`, so that the
+    /// vectors of both are reused.
+    sample: SampledTransition,
+    /// The sampled transitions of a batch.
+    samples: Vec<SampledTransition>,
     raw_observation: Vec<f32>,
     raw_goal: Vec<f32>,
 }
@@ -71,14 +75,14 @@ impl Sampler {
     #[must_use]
     pub fn new(config: &ReplayConfig, layout: impl Into<TaskSpec>) -> Self {
         let layout = layout.into();
-        let sample = Relabelled {
+        let sample = SampledTransition {
             steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; layout.n_arms()],
             goal: vec![0.0; layout.n_goal()],
             rewards: vec![0.0; config.reward.n_heads(&layout)],
             keeps_goal: vec![true; layout.n_arms()],
             swapped: false,
             reflected: false,
-            touches: false,
+            has_contact: false,
         };
         let (raw_observation, raw_goal) =
             (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
@@ -121,59 +125,47 @@ impl Sampler {
         rng: &mut ChaCha8Rng,
         batch: &mut Batch,
     ) {
-        let n_input = self.layout.n_observation() + self.layout.n_goal();
-        let (n_action, n_heads) = (self.layout.n_action(), self.sample.rewards.len());
-        let n_rows = batch.rewards.len() / n_heads;
+        let n_rows = batch.rewards.len() / self.sample.rewards.len();
+        self.sample_transitions(n_rows, buffer, rng);
+        self.prefetch(buffer);
+        for row in 0..n_rows {
+            std::mem::swap(&mut self.sample, &mut self.samples[row]);
+            self.write_row(row, buffer, statistics, batch);
+        }
+    }
+
+    /// Samples the transitions of a batch of `n_rows` into `samples`, whose memory is reused.
+    fn sample_transitions(&mut self, n_rows: usize, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         self.samples.resize_with(n_rows, || self.sample.clone());
         for row in 0..n_rows {
             self.sample_transition(buffer, rng);
             std::mem::swap(&mut self.sample, &mut self.samples[row]);
         }
-        self.load(buffer);
-        for row in 0..n_rows {
-            std::mem::swap(&mut self.sample, &mut self.samples[row]);
-            let row_of = |n: usize| row * n..(row + 1) * n;
-            self.write_input(buffer, 0, statistics, &mut batch.inputs[row_of(n_input)]);
-            self.write_input(buffer, 1, statistics, &mut batch.next_inputs[row_of(n_input)]);
-            self.write_action(
-                buffer,
-                &mut batch.actions[row_of(n_action)],
-                &mut batch.bc_mask[row_of(n_action)],
-            );
-            batch.rewards[row_of(n_heads)].copy_from_slice(&self.sample.rewards);
-            for (head, reward) in batch.rewards[row_of(n_heads)].iter_mut().enumerate() {
-                let arms = if n_heads == 1 { 0..self.layout.n_arms() } else { head..head + 1 };
-                let costs = arms.map(|arm| self.cost_of_contacts(buffer, ArmIndex(arm)));
-                *reward -= costs.fold(0.0, f32::max);
-            }
-            if self.sample.swapped && n_heads > 1 {
-                batch.rewards[row_of(n_heads)].reverse();
-            }
-        }
     }
 
-    /// Reads the observations of all sampled transitions into the caches. A buffer is larger than the caches, and
-    /// processors wait for many independent reads at once, but for few at a time while rows are copied one by one.
-    fn load(&self, buffer: &ReplayBuffer) {
-        /// Numbers of a cache line.
-        const LINE: usize = 16;
-        let mut read = 0.0;
-        for StepIndex { episode_idx, step_idx } in self.samples.iter().flat_map(|s| &s.steps) {
-            for later in 0..2 {
-                let observation = buffer.observation(*episode_idx, step_idx + later);
-                read += observation.iter().step_by(LINE).sum::<f32>();
-            }
-        }
-        std::hint::black_box(read);
-    }
-
+    /// Samples a transition: the steps of the arms' parts, its symmetries, then goals and rewards.
+    ///
+    /// The order of the draws determines a run's results, so it must not change: some numbers are drawn although the
+    /// settings or the task rule out their effect.
     fn sample_transition(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
+        self.sample_steps(buffer, rng);
+        self.sample.swapped =
+            bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
+        self.sample_reflection(buffer, rng);
+        match self.config.reward {
+            RewardKind::Joint => self.relabel_jointly(buffer, rng),
+            RewardKind::PerArm => self.relabel_arms(buffer, rng),
+        }
+    }
+
+    /// Samples one step for all arms, or two steps that two arms combine (CoDA).
+    fn sample_steps(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let first = self.sample_step(buffer, rng);
         self.sample.steps.fill(first);
-        self.sample.touches = false;
-        let per_arm =
+        self.sample.has_contact = false;
+        let can_combine =
             self.config.reward == RewardKind::PerArm && self.layout.has_recombinable_arms();
-        if bernoulli(rng, self.config.coda_fraction) && per_arm {
+        if bernoulli(rng, self.config.coda_fraction) && can_combine {
             let second = self.sample_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
                 self.sample.steps[1] = second;
@@ -182,15 +174,8 @@ impl Sampler {
                 && bernoulli(rng, self.config.coda_contact_prob)
             {
                 self.sample.steps[1] = second;
-                self.sample.touches = true;
+                self.sample.has_contact = true;
             }
-        }
-        self.sample.swapped =
-            bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
-        self.sample_reflection(buffer, rng);
-        match self.config.reward {
-            RewardKind::Joint => self.relabel_jointly(buffer, rng),
-            RewardKind::PerArm => self.relabel_arms(buffer, rng),
         }
     }
 
@@ -211,8 +196,9 @@ impl Sampler {
         self.sample.reflected = bernoulli(rng, self.config.reflection_prob) && are_independent();
     }
 
+    /// Samples a step, of an episode in which an object was displaced or of any episode.
     fn sample_step(&self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) -> StepIndex {
-        // The draws of a run keep their place in the random stream: this one belonged to a removed setting.
+        // This draw belonged to a removed setting. Without it, all later draws of a run would change.
         let _: bool = bernoulli(rng, 0.0);
         let displaced = buffer.displaced_episodes();
         let from_displaced =
@@ -225,18 +211,19 @@ impl Sampler {
         StepIndex { episode_idx, step_idx: index(rng, self.layout.episode_steps()) }
     }
 
+    /// Samples each arm's goal, or one later step for all arms if they share an object, and rewards each arm.
     fn relabel_arms(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let shared = self
             .layout
             .shares_object()
-            .then(|| self.hindsight_step(self.sample.steps[0], buffer, rng));
+            .then(|| self.sample_later_step(self.sample.steps[0], buffer, rng));
         for arm in self.layout.arms() {
             let later_step = shared
-                .unwrap_or_else(|| self.hindsight_step(self.sample.steps[arm.0], buffer, rng));
+                .unwrap_or_else(|| self.sample_later_step(self.sample.steps[arm.0], buffer, rng));
             self.sample.keeps_goal[arm.0] = later_step.is_none();
-            self.take_goal(buffer, arm, later_step);
+            self.relabel_goal(buffer, arm, later_step);
             if arm.0 == 0 {
-                self.take_common_goal(buffer, later_step);
+                self.relabel_common_goal(buffer, later_step);
             }
         }
         let norm = self.layout.norm();
@@ -248,31 +235,32 @@ impl Sampler {
             let distance = norm.of_accumulated(self.arm_distance(buffer, arm));
             let own = sparse_reward_within(self.config.goal_tolerance_m, distance);
             let reward = if common == REWARD_ACHIEVED { own } else { common };
-            self.sample.rewards[arm.0] = reward - self.feedback(buffer, arm);
+            self.sample.rewards[arm.0] = reward - self.intervention_cost_of(buffer, arm);
         }
     }
 
+    /// Samples one later step for the goals of all arms, and rewards them jointly.
     fn relabel_jointly(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
-        let later_step = self.hindsight_step(self.sample.steps[0], buffer, rng);
+        let later_step = self.sample_later_step(self.sample.steps[0], buffer, rng);
         self.sample.keeps_goal.fill(later_step.is_none());
-        self.take_common_goal(buffer, later_step);
+        self.relabel_common_goal(buffer, later_step);
         let norm = self.layout.norm();
         let mut accumulated = 0.0;
         for arm in self.layout.arms() {
-            self.take_goal(buffer, arm, later_step);
+            self.relabel_goal(buffer, arm, later_step);
             accumulated = norm.combined(accumulated, self.arm_distance(buffer, arm));
         }
         accumulated = norm.combined(accumulated, self.common_distance(buffer));
         let distance = norm.of_accumulated(accumulated);
-        let feedback = self.layout.arms().map(|arm| self.feedback(buffer, arm));
-        let feedback = feedback.fold(0.0, f32::max);
+        let costs = self.layout.arms().map(|arm| self.intervention_cost_of(buffer, arm));
+        let cost = costs.fold(0.0, f32::max);
         self.sample.rewards[0] =
-            sparse_reward_within(self.config.goal_tolerance_m, distance) - feedback;
+            sparse_reward_within(self.config.goal_tolerance_m, distance) - cost;
     }
 
     /// Returns the cost to `arm` of its sampled step: that of an intervention, if the teacher overrides the arm on the
     /// next step and did not on this one, and the arm has its desired goal.
-    fn feedback(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
+    fn intervention_cost_of(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
         let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
         let is_last = step_idx + 1 == self.layout.episode_steps();
         if self.intervention_cost == 0.0 || !self.sample.keeps_goal[arm.0] || is_last {
@@ -281,14 +269,6 @@ impl Sampler {
         let is_advised = |step_idx| buffer.advised_arms(episode_idx, step_idx) >> arm.0 & 1 == 1;
         let leads_to_intervention = !is_advised(step_idx) && is_advised(step_idx + 1);
         if leads_to_intervention { self.intervention_cost } else { 0.0 }
-    }
-
-    /// Returns the cost to `arm` of the contacts of its sampled step.
-    fn cost_of_contacts(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
-        let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
-        let contacts = buffer.contacts(episode_idx, step_idx);
-        let touches_arm = self.sample.touches || contacts.contains(Contacts::ARM_ARM);
-        if touches_arm || contacts.touches_table(arm) { self.contact_cost } else { 0.0 }
     }
 
     /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.
@@ -314,98 +294,42 @@ impl Sampler {
         self.layout.norm().accumulate(&achieved, &goal.of(&self.sample.goal))
     }
 
-    /// Samples the later step whose achieved goal replaces the desired one (strategy "future"); `None` keeps the
-    /// desired goal.
-    fn hindsight_step(
+    /// Samples the later step whose achieved goal replaces the desired one; `None` keeps the desired goal.
+    fn sample_later_step(
         &self,
         StepIndex { episode_idx, step_idx }: StepIndex,
         buffer: &ReplayBuffer,
         rng: &mut ChaCha8Rng,
     ) -> Option<usize> {
-        let hindsight = bernoulli(rng, self.config.her_ratio);
-        let later_step = step_idx + 1 + index(rng, self.layout.episode_steps() - step_idx);
         let observation = |step_idx| buffer.observation(episode_idx, step_idx);
-        let is_goal = !self.config.displaced_hindsight
-            || self.layout.is_displaced(observation(0), observation(later_step));
-        (hindsight && is_goal).then_some(later_step)
+        hindsight::sample_later_step(&self.config, &self.layout, observation, step_idx, rng)
     }
 
-    fn take_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {
+    /// Sets `arm`'s part of the goal: to what the arm achieved before `later_step`, or to the desired goal.
+    fn relabel_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {
         let (achieved, part) = (self.layout.achieved_goal_of(arm), self.layout.goal_of(arm));
         let episode_idx = self.sample.steps[arm.0].episode_idx;
         write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
     }
 
-    fn take_common_goal(&mut self, buffer: &ReplayBuffer, later_step: Option<usize>) {
+    /// As [`Self::relabel_goal`], for the part that is common to all arms.
+    fn relabel_common_goal(&mut self, buffer: &ReplayBuffer, later_step: Option<usize>) {
         let (achieved, part) = (self.layout.common_achieved_goal(), self.layout.common_goal());
         let episode_idx = self.sample.steps[0].episode_idx;
         write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
     }
+}
 
-    /// Writes the normalised observation, `later` steps after the sampled ones, and the normalised goal.
-    fn write_input(
-        &mut self,
-        buffer: &ReplayBuffer,
-        later: usize,
-        statistics: Statistics<'_>,
-        input: &mut [f32],
-    ) {
-        let (normalized_observation, normalized_goal) =
-            input.split_at_mut(self.layout.n_observation());
-        let layout = &self.layout;
-        for (to, from) in layout.arms().zip(self.sources()) {
-            let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
-            let observation = buffer.observation(episode_idx, step_idx + later);
-            if self.sample.reflected {
-                layout.reflect_observation(to, from, observation, &mut self.raw_observation);
-                layout.reflect_goal(to, from, &self.sample.goal, &mut self.raw_goal);
-                continue;
-            }
-            let (part, source) = (layout.observation_of(to), layout.observation_of(from));
-            part.copy_from(&mut self.raw_observation, source, observation);
-            let (part, source) = (layout.goal_of(to), layout.goal_of(from));
-            part.copy_from(&mut self.raw_goal, source, &self.sample.goal);
-        }
-        let StepIndex { episode_idx, step_idx } = self.sample.steps[0];
-        let (common, observation) =
-            (layout.common_observation(), buffer.observation(episode_idx, step_idx + later));
-        common.copy_from(&mut self.raw_observation, common, observation);
-        let common = layout.common_goal();
-        common.copy_from(&mut self.raw_goal, common, &self.sample.goal);
-        statistics.observation.normalize(&self.raw_observation, normalized_observation);
-        statistics.goal.normalize(&self.raw_goal, normalized_goal);
-    }
-
-    fn write_action(&self, buffer: &ReplayBuffer, actions: &mut [f32], bc_mask: &mut [f32]) {
-        for (to, from) in self.layout.arms().zip(self.sources()) {
-            let StepIndex { episode_idx, step_idx } = self.sample.steps[from.0];
-            let action = buffer.action(episode_idx, step_idx);
-            if self.sample.reflected {
-                self.layout.reflect_action(to, from, action, actions);
-            } else {
-                self.layout.action_of(to).copy_from(actions, self.layout.action_of(from), action);
-            }
-            let is_advised = buffer.advised_arms(episode_idx, step_idx) >> from.0 & 1 == 1;
-            let foresight = self.config.contact_foresight_steps;
-            let leads_to_contact =
-                self.sample.touches || self.touches_within(buffer, from, foresight);
-            let is_cloned = is_advised && !leads_to_contact;
-            self.layout.action_of(to).fill(bc_mask, if is_cloned { 1.0 } else { 0.0 });
-        }
-    }
-
-    /// Returns true if `arm` touches another arm or the table on one of `n_steps` steps from its sampled one on.
-    fn touches_within(&self, buffer: &ReplayBuffer, arm: ArmIndex, n_steps: usize) -> bool {
-        let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
-        let end = (step_idx + n_steps).min(self.layout.episode_steps());
-        buffer.has_contact_of(arm, step_idx..end, episode_idx)
-    }
-
-    /// Returns the arm whose data fills each place: the arms in order, or in reverse if they are swapped.
-    fn sources(&self) -> impl Iterator<Item = ArmIndex> + use<> {
-        let (n_arms, swapped) = (self.layout.n_arms(), self.sample.swapped);
-        (0..n_arms).map(move |arm| ArmIndex(if swapped { n_arms - 1 - arm } else { arm }))
-    }
+/// Returns each arm's place and the arm whose data fills it: the arms in order, or in reverse order if they are
+/// swapped.
+pub(crate) fn arm_sources(
+    n_arms: usize,
+    swapped: bool,
+) -> impl Iterator<Item = (ArmIndex, ArmIndex)> {
+    (0..n_arms).map(move |place| {
+        let source = if swapped { n_arms - 1 - place } else { place };
+        (ArmIndex(place), ArmIndex(source))
+    })
 }
 
 /// Writes the part of a stored episode's goal, or what it achieved of it before `later_step`, into `goal`.

@@ -41,8 +41,9 @@
 //!
 //! // One update of critic and actor, then Polyak averaging of their target networks.
 //! let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
+//! let settings = config.at_round(0).update;
 //! let mut ddpg = Ddpg::new(config.ddpg, &layout, rewards, config.seed);
-//! let losses = ddpg.update(&batch)?;
+//! let losses = ddpg.update(settings, &batch)?;
 //! ddpg.polyak();
 //! assert!(losses.critic_loss.is_finite() && ddpg.n_updates() == 1);
 //! # Ok::<(), Box<dyn std::error::Error>>(())

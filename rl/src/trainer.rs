@@ -4,9 +4,8 @@
 
 use std::collections::BTreeMap;
 
-use rand_chacha::ChaCha8Rng;
 use sha2::{Digest as _, Sha256};
-use tandem_core::rng::{Stream, bernoulli, episode_rng, index};
+use tandem_core::rng::{Stream, episode_rng};
 use tandem_core::task::Part;
 use tandem_core::text::{counted, hex};
 use tandem_core::work::PublishedActor;
@@ -17,7 +16,7 @@ use tandem_policy::{Normalizer, NormalizerSnapshot, Policy};
 use crate::config::{Behaviour, ConfigError, PolyakEvery, RunConfig};
 use crate::ddpg::{Batch, Ddpg, DdpgError, Rewards};
 use crate::ensemble::CriticEnsemble;
-use crate::her::{Sampler, Statistics};
+use crate::her::{Sampler, Statistics, arm_sources, relabelled_goal};
 use crate::jump_start::JumpStart;
 use crate::replay::ReplayBuffer;
 
@@ -249,16 +248,13 @@ impl Trainer {
             observation: self.observation_normalizer.snapshot(),
             goal: self.goal_normalizer.snapshot(),
         };
-        self.ddpg.set_cooldown(self.config.is_cooldown(self.counters.round));
-        self.ddpg.set_discount(self.config.discount(self.counters.round));
-        self.ddpg.set_bc_weight(self.config.bc_weight(self.counters.round));
-        self.ddpg.set_bc_filter(self.config.filters_advice(self.counters.round));
-        self.sampler.set_contact_cost(self.config.contact_cost(self.counters.round));
+        let settings = self.config.at_round(self.counters.round);
+        self.sampler.set_contact_cost(settings.contact_cost);
         let n_updates = self.config.updates_per_round();
         let mut sums = RoundStats::default();
         for update in 1..=n_updates {
             self.sampler.fill(&self.replay, statistics, &mut rng, &mut self.batch);
-            let losses = self.ddpg.update(&self.batch)?;
+            let losses = self.ddpg.update(settings.update, &self.batch)?;
             if let Some(ensemble) = &mut self.ensemble
                 && !ensemble.update(self.ddpg.critic_batch())
             {
@@ -382,11 +378,11 @@ impl Trainer {
     /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.
     fn update_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
-        let both_orders =
-            self.config.replay.arm_swap_prob > 0.0 && self.layout.has_interchangeable_arms();
+        let replay = &self.config.replay;
+        let both_orders = replay.arm_swap_prob > 0.0 && self.layout.has_interchangeable_arms();
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
         for step_idx in 0..episode.n_steps() {
-            let goal = self.relabelled_goal(episode, step_idx, &mut rng);
+            let goal = relabelled_goal(replay, &self.layout, episode, step_idx, &mut rng);
             let observation = episode.observation(step_idx);
             observations.extend_from_slice(observation);
             goals.extend_from_slice(&goal);
@@ -399,41 +395,10 @@ impl Trainer {
         self.goal_normalizer.update(&goals);
     }
 
-    fn relabelled_goal(
-        &self,
-        episode: &Episode,
-        step_idx: usize,
-        rng: &mut ChaCha8Rng,
-    ) -> Vec<f32> {
-        let mut goal = episode.goal.clone();
-        let (layout, replay) = (&self.layout, &self.config.replay);
-        let mut draw = || {
-            let hindsight = bernoulli(rng, replay.her_ratio);
-            (hindsight, step_idx + 1 + index(rng, layout.episode_steps() - step_idx))
-        };
-        let joint = (replay.joint_goal_statistics || layout.shares_object()).then(&mut draw);
-        for arm in layout.arms() {
-            let (hindsight, later_step) = joint.unwrap_or_else(&mut draw);
-            let observation = episode.observation(later_step);
-            let is_goal = !replay.displaced_hindsight
-                || layout.is_displaced(episode.observation(0), observation);
-            if !(hindsight && is_goal) {
-                continue;
-            }
-            layout.goal_of(arm).copy_from(&mut goal, layout.achieved_goal_of(arm), observation);
-            if arm.0 == 0 {
-                let achieved = layout.common_achieved_goal();
-                layout.common_goal().copy_from(&mut goal, achieved, observation);
-            }
-        }
-        goal
-    }
-
     /// Returns a vector in which the parts of the arms have the reverse order.
     fn swapped(&self, vector: &[f32], part_of: fn(&TaskSpec, ArmIndex) -> &Part) -> Vec<f32> {
         let (layout, mut swapped) = (&self.layout, vector.to_vec());
-        let reversed = (0..layout.n_arms()).rev().map(ArmIndex);
-        for (to, from) in layout.arms().zip(reversed) {
+        for (to, from) in arm_sources(layout.n_arms(), true) {
             part_of(layout, to).copy_from(&mut swapped, part_of(layout, from), vector);
         }
         swapped

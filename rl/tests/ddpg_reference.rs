@@ -47,13 +47,14 @@ fn assert_close(what: &str, got: &[f32], expected: &Value) {
 fn every_update_agrees_with_the_reference() {
     let reference: Value = serde_json::from_str(REFERENCE).unwrap();
     let config: DdpgConfig = serde_json::from_value(reference["config"].clone()).unwrap();
+    let settings = config.without_schedules();
     let mut ddpg = Ddpg::new(config, Layout::new(Task::Push, 1), Rewards::sparse(2), 0);
     for (n_before, update) in (0..).zip(reference["updates"].as_array().unwrap()) {
         let before = update["before"].as_object().unwrap();
         let before: Vec<_> =
             before.iter().map(|(name, vector)| (name.clone(), f32s(vector))).collect();
         ddpg.restore(&before, n_before).unwrap();
-        let losses = ddpg.update(&batch(&update["batch"])).unwrap();
+        let losses = ddpg.update(settings, &batch(&update["batch"])).unwrap();
         ddpg.polyak();
         for (name, got) in [
             ("critic_loss", losses.critic_loss),

@@ -280,7 +280,7 @@ fn check_task(own_file: &Path, settings: &[(String, Value)]) -> Result<(), Faile
     let of_run = [
         ("task", run.task.clone()),
         ("arms", run.arms.to_string()),
-        ("recipe", recipe_name(run.recipe).to_owned()),
+        ("recipe", run.recipe.to_string()),
     ];
     for (key, of_run) in of_run {
         let given = settings.iter().rev().find(|(name, _)| name == key).map(|(_, value)| value);
@@ -327,13 +327,13 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     let integer =
         |n: u64| i64::try_from(n).map_or_else(|_| Value::String(n.to_string()), Value::Integer);
     let recipe = args.recipe.map(|recipe| match recipe {
-        RecipeName::Tandem => recipe_name(Recipe::Tandem),
-        RecipeName::Paper => recipe_name(Recipe::Paper),
+        RecipeName::Tandem => Recipe::Tandem,
+        RecipeName::Paper => Recipe::Paper,
     });
     let flags = [
         ("task", task.map(|task| Value::String(task.name().to_owned()))),
         ("arms", args.arms.map(|n| integer(n as u64))),
-        ("recipe", recipe.map(|name| Value::String(name.to_owned()))),
+        ("recipe", recipe.map(|recipe| Value::String(recipe.to_string()))),
         ("advice.strategy", args.strategy.clone().map(Value::String)),
         ("advice.budget", args.budget.map(integer)),
         ("seed", args.seed.map(integer)),
@@ -343,13 +343,6 @@ fn settings_of(args: &TrainArgs) -> Result<Vec<(String, Value)>, Failed> {
     ];
     settings.extend(flags.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
     Ok(settings)
-}
-
-const fn recipe_name(recipe: Recipe) -> &'static str {
-    match recipe {
-        Recipe::Tandem => "tandem",
-        Recipe::Paper => "paper",
-    }
 }
 
 /// Returns one worker per core, at most one per slot.

@@ -212,7 +212,7 @@ impl TeacherFile {
     pub(super) fn other_recipe(&self, config: &RunConfig) -> Option<String> {
         let Source::Policy(policy) = &self.source else { return None };
         let trained_with = policy.metadata.get("recipe")?;
-        if config.recipe != Recipe::Paper || trained_with == "paper" {
+        if config.recipe != Recipe::Paper || trained_with == Recipe::Paper.name() {
             return None;
         }
         Some(format!(

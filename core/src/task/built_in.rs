@@ -6,9 +6,12 @@ use super::{
     ArmDescription, ArmManipulation, Condition, Manipulation, Norm, Reflection, TaskDescription,
 };
 use crate::bounds::GOAL_BOUND_M;
+use crate::layout::observation::{
+    FINGER_OPENINGS, FINGER_RATES, HAND_POSITION, HAND_TO_OBJECT, HAND_VELOCITY,
+    OBJECT_ANGULAR_VELOCITY, OBJECT_ORIENTATION, OBJECT_POSITION, OBJECT_VELOCITY,
+};
 use crate::layout::{
-    ArmIndex, EPISODE_STEPS, GOAL_TOLERANCE_M, HAND_POSITION, Layout, OBJECT_POSITION,
-    WORKSPACE_DISTANCE_M, World,
+    ArmIndex, EPISODE_STEPS, GOAL_TOLERANCE_M, Layout, WORKSPACE_DISTANCE_M, World,
 };
 
 /// Smallest gap along x, metres, between the hands and objects of two arms whose transitions come from different steps:
@@ -20,12 +23,15 @@ const SHARED_RECOMBINATION_GAP_M: f32 = 0.16;
 
 /// Number of steps for which a bar must be held at its goal.
 const CARRIED_STEPS: usize = 5;
-/// Within an arm's observation, its object relative to its hand, the openings of its fingers, and the components of its
-/// object's quaternion that are the sine of half the tilt.
-const HAND_TO_OBJECT_ACROSS: Range<usize> = 6..8;
-const HAND_TO_OBJECT_UP: Range<usize> = 8..9;
-const FINGER_OPENINGS: Range<usize> = 9..12;
-const OBJECT_TILT: Range<usize> = 12..14;
+/// Offsets of the components of a vector or a quaternion.
+const X: usize = 0;
+const Y: usize = 1;
+const Z: usize = 2;
+/// Horizontal and vertical components of [`HAND_TO_OBJECT`].
+const HAND_TO_OBJECT_ACROSS: Range<usize> = HAND_TO_OBJECT.start..HAND_TO_OBJECT.start + Z;
+const HAND_TO_OBJECT_UP: Range<usize> = HAND_TO_OBJECT.start + Z..HAND_TO_OBJECT.end;
+/// The components x and y of an object's quaternion, which are the sine of half the tilt.
+const OBJECT_TILT: Range<usize> = OBJECT_ORIENTATION.start..OBJECT_ORIENTATION.start + Z;
 /// Horizontal and vertical distance from its handle within which a hand holds it, metres: its pads reach the end of the
 /// bar from 5 cm beyond the handle, and its section from 4 cm above it.
 const HOLDING_DISTANCES_M: [f32; 2] = [0.06, 0.045];
@@ -97,13 +103,20 @@ impl Layout {
             return Reflection::default();
         }
         // Of each finger, opening and rate. The first two places show the same finger.
-        let fingers = [9, 25].into_iter();
+        let fingers = [FINGER_OPENINGS.start, FINGER_RATES.start].into_iter();
         Reflection {
-            // The distance between hand and object; the object's quaternion; velocities.
-            observation: vec![7, 12, 14, 17, 19, 21, 23],
-            position: vec![HAND_POSITION.start + 1, OBJECT_POSITION.start + 1],
-            goal: vec![1],
-            action: vec![1],
+            observation: vec![
+                HAND_TO_OBJECT.start + Y,
+                OBJECT_ORIENTATION.start + X,
+                OBJECT_ORIENTATION.start + Z,
+                OBJECT_VELOCITY.start + Y,
+                OBJECT_ANGULAR_VELOCITY.start + X,
+                OBJECT_ANGULAR_VELOCITY.start + Z,
+                HAND_VELOCITY.start + Y,
+            ],
+            position: vec![HAND_POSITION.start + Y, OBJECT_POSITION.start + Y],
+            goal: vec![Y],
+            action: vec![Y],
             moved: fingers.flat_map(|at| [[at, at + 2], [at + 1, at + 2], [at + 2, at]]).collect(),
             plane: 0.0,
             // Both bases lie in the plane, and a Mico's links have mirror images.
@@ -124,7 +137,7 @@ impl Layout {
         }
     }
 
-    /// When `arm` holds its handle, and when the bar is level.
+    /// Returns the conditions under which `arm` holds its handle and the bar is level.
     fn carries(self, arm: ArmIndex) -> ArmManipulation {
         let first = self.observation_of(arm).start;
         let numbers = |range: Range<usize>| range.map(|idx| first + idx).collect::<Vec<usize>>();

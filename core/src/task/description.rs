@@ -62,7 +62,7 @@ pub struct TaskDescription {
     pub goal_bound: Vec<f32>,
     /// The arms in order, 1 to 8.
     pub arms: Vec<ArmDescription>,
-    /// What the arms share, when they hold objects, and what success needs beyond the distance to the goal.
+    /// Shared objects, conditions of holding an object, and conditions of success beyond the distance to the goal.
     #[serde(default, skip_serializing_if = "Manipulation::is_default")]
     pub manipulation: Manipulation,
     /// A mirror symmetry of the world, if it has one.

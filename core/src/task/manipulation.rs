@@ -1,12 +1,12 @@
-//! How the arms of a task manipulate objects: what they share, when an arm holds its object, and what success needs
-//! beyond the distance to the goal.
+//! Manipulation of objects by the arms of a task: shared objects, conditions of holding an object, and conditions of
+//! success beyond the distance to the goal.
 
 use serde::{Deserialize, Serialize};
 
 use super::Norm;
 
-/// How the arms of a task manipulate objects. The default is that of tasks in which each arm has an object of its own,
-/// and in which an episode succeeds if its last step achieves the goal.
+/// Manipulation of objects by the arms of a task. The default is that of tasks in which each arm has an object of its
+/// own, and in which an episode succeeds if its last step achieves the goal.
 #[derive(Debug, Clone, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Manipulation {
@@ -22,7 +22,7 @@ pub struct Manipulation {
     pub arms: Vec<ArmManipulation>,
 }
 
-/// How one arm manipulates its object. Indices are those of the task's vectors and belong to the arm.
+/// Manipulation of an object by one arm. Indices are those of the task's vectors and belong to the arm.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ArmManipulation {

@@ -44,8 +44,8 @@ impl Part {
     }
 
     /// Returns the indices as a range if they are contiguous and ascending.
-    #[must_use]
-    pub fn as_range(&self) -> Option<Range<usize>> {
+    #[cfg(test)]
+    pub(super) fn as_range(&self) -> Option<Range<usize>> {
         match &self.0 {
             Indices::Contiguous(range) => Some(range.clone()),
             Indices::Scattered(_) => None,

@@ -51,7 +51,7 @@ struct Place {
     offset: f32,
 }
 
-/// What a reflection does to the vectors of an arm.
+/// The effect of a reflection on the vectors of an arm.
 #[derive(Debug)]
 pub(super) struct ReflectionMap {
     observation: Places,

@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, VecDeque};
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Wilson};
 use tandem_policy::Policy;
 use tandem_policy::policy::RANDOMIZATION_KEY;
-use tandem_rl::config::Recipe;
 use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::EvaluationFinished;
 use tandem_telemetry::{ContactMetrics, MetricsRow};
@@ -94,7 +93,7 @@ impl<'a> Evaluations<'a> {
         let mut row = self.training_row(&pending);
         let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
         add_summary(&mut row, &EvaluationSummary::of(&outcomes));
-        let is_cooldown = row.round > 0 && self.config.run.is_cooldown(row.round - 1);
+        let is_cooldown = row.round > 0 && self.config.run.at_round(row.round - 1).is_cooldown;
         let best = self.history().best_row();
         row.best = best.is_none_or(|best| is_better(&row, best, is_cooldown));
         EvaluationFinished {
@@ -128,7 +127,7 @@ impl<'a> Evaluations<'a> {
         let entries = [
             ("run", run.name.clone()),
             ("seed", run.seed.to_string()),
-            ("recipe", if run.recipe == Recipe::Tandem { "tandem" } else { "paper" }.to_owned()),
+            ("recipe", run.recipe.to_string()),
             ("strategy", run.advice.strategy.clone()),
             ("advice_share", run.advice.share.to_string()),
             ("substeps", run.world.substeps.to_string()),

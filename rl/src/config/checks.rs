@@ -6,7 +6,7 @@ use tandem_core::TaskSpec;
 use tandem_core::evaluation::TEST_SEED;
 use tandem_core::settings::OutOfRange;
 
-use super::{ConfigError, RunConfig};
+use super::{ConfigError, EvaluationConfig, RunConfig};
 
 /// Most episodes of a round, whose reservations a teacher takes in one request.
 const MAX_EPISODES: usize = 65_536;
@@ -41,14 +41,10 @@ impl RunConfig {
         check("seed", self.seed, self.seed != TEST_SEED, expected)?;
         let is_own = self.seed != self.evaluation.seed;
         check("seed", self.seed, is_own, "another than evaluation.seed")?;
-        let episodes = self.evaluation.episodes;
-        let is_count = (1..=100_000).contains(&episodes);
-        check("evaluation.episodes", episodes, is_count, "1 to 100,000")?;
-        let early = self.evaluation.early_points;
-        check("evaluation.early_points", early, early <= 100, "0 to 100")?;
-        let test_episodes = self.evaluation.test_episodes;
-        let is_count = (1..=100_000).contains(&test_episodes);
-        check("evaluation.test_episodes", test_episodes, is_count, "1 to 100,000")?;
+        let EvaluationConfig { episodes, early_points, test_episodes, .. } = self.evaluation;
+        OutOfRange::check_range("evaluation.episodes", episodes, 1..=100_000)?;
+        OutOfRange::check_range("evaluation.early_points", early_points, 0..=100)?;
+        OutOfRange::check_range("evaluation.test_episodes", test_episodes, 1..=100_000)?;
         let every_rounds = self.checkpoint.every_rounds;
         check("checkpoint.every_rounds", every_rounds, every_rounds > 0, "at least 1")?;
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
@@ -67,16 +63,15 @@ impl RunConfig {
         let expected =
             "none for this task: the arms have common numbers, so none has a task of its own";
         check("advice.strategy", strategy, can_be_advised, expected)?;
-        let (share, budget) = (self.advice.share, self.advice_budget());
-        check("advice.share", share, (0.0..=1.0).contains(&share), "a number in [0, 1]")?;
+        OutOfRange::check_fraction("advice.share", self.advice.share)?;
+        let budget = self.advice_budget();
         check("advice.budget", budget, budget <= 1_000_000_000_000, "at most 10^12 in the run")
     }
 
     fn check_rounds(&self) -> Result<(), OutOfRange> {
         let rounds = &self.rounds;
         check("rounds.slots", rounds.slots, (1..=4096).contains(&rounds.slots), "1 to 4096")?;
-        let is_slot = (1..=64).contains(&rounds.rollouts);
-        check("rounds.rollouts", rounds.rollouts, is_slot, "1 to 64")?;
+        OutOfRange::check_range("rounds.rollouts", rounds.rollouts, 1..=64)?;
         let is_round = rounds.slots * rounds.rollouts <= MAX_EPISODES;
         let expected =
             "at most 65,536 / rounds.rollouts, because a teacher advises no more episodes";
@@ -85,16 +80,12 @@ impl RunConfig {
         let updates = rounds.updates_per_env_step;
         let is_rate = (1e-9..=100.0).contains(&updates);
         check("rounds.updates_per_env_step", updates, is_rate, "1e-9 to 100")?;
-        let greedy = rounds.final_greedy_share;
-        let is_share = (0.0..=1.0).contains(&greedy);
-        check("rounds.final_greedy_share", greedy, is_share, "a number in [0, 1]")?;
-        let is_epoch = (1..=1_000_000).contains(&rounds.per_epoch);
-        check("rounds.per_epoch", rounds.per_epoch, is_epoch, "1 to 1,000,000")
+        OutOfRange::check_fraction("rounds.final_greedy_share", rounds.final_greedy_share)?;
+        OutOfRange::check_range("rounds.per_epoch", rounds.per_epoch, 1..=1_000_000)
     }
 
     fn check_stop(&self) -> Result<(), OutOfRange> {
-        let until = self.stop.until_success;
-        check("stop.until_success", until, (0.0..=1.0).contains(&until), "a number in [0, 1]")?;
+        OutOfRange::check_fraction("stop.until_success", self.stop.until_success)?;
         let minutes = self.stop.max_minutes;
         let is_time = minutes >= 0.0 && minutes.is_finite();
         check("stop.max_minutes", minutes, is_time, "0 (never) or more")

@@ -1,5 +1,8 @@
 //! The values that a recipe gives to every setting.
 
+use std::fmt;
+use std::str::FromStr;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tandem_core::{AdviceUnit, Exploration, JudgedAction, Task, TaskSpec, World, WorldSettings};
@@ -19,6 +22,42 @@ pub enum Recipe {
     Paper,
     /// The values that learn fastest on two cores.
     Tandem,
+}
+
+impl Recipe {
+    /// Both recipes.
+    pub const ALL: [Self; 2] = [Self::Paper, Self::Tandem];
+
+    /// Returns the name used in files and on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Paper => "paper",
+            Self::Tandem => "tandem",
+        }
+    }
+}
+
+impl fmt::Display for Recipe {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// An unknown name of a recipe.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("recipe is {0:?}: expected \"tandem\" or \"paper\"")]
+pub struct UnknownRecipe(pub String);
+
+impl FromStr for Recipe {
+    type Err = UnknownRecipe;
+
+    fn from_str(name: &str) -> Result<Self, UnknownRecipe> {
+        Self::ALL
+            .into_iter()
+            .find(|recipe| recipe.name() == name)
+            .ok_or_else(|| UnknownRecipe(name.to_owned()))
+    }
 }
 
 /// Rounds of the paper's epoch (decision 005).
@@ -144,18 +183,18 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
     }
 }
 
-/// Returns whether the task is a built-in one of the world `shared`.
+/// Returns true if the task is a built-in one of the world `shared`.
 fn is_shared(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
 }
 
-/// Returns whether arms carry objects through an area that they share, each its own. An arm whose way is blocked then
+/// Returns true if arms carry objects through an area that they share, each its own. An arm whose way is blocked then
 /// has to wait until the other has made room (decisions 041 and 042).
 fn carries_past_others(layout: &TaskSpec) -> bool {
     is_shared(layout) && grasps(layout) && layout.n_arms() > 1
 }
 
-/// Returns whether the task is a built-in one in which arms grasp objects.
+/// Returns true if the task is a built-in one in which arms grasp objects.
 fn grasps(layout: &TaskSpec) -> bool {
     layout.as_built_in().is_some_and(|layout| layout.task.grasps())
 }

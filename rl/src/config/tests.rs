@@ -18,6 +18,16 @@ fn every_recipe_passes_its_own_checks() {
 }
 
 #[test]
+fn a_recipe_parses_from_the_name_that_files_have() {
+    for recipe in Recipe::ALL {
+        assert_eq!(serde_json::to_value(recipe).unwrap(), recipe.name());
+        assert_eq!(recipe.to_string().parse(), Ok(recipe));
+    }
+    let message = "baselines".parse::<Recipe>().unwrap_err().to_string();
+    assert_eq!(message, "recipe is \"baselines\": expected \"tandem\" or \"paper\"");
+}
+
+#[test]
 fn the_papers_round_has_forty_updates() {
     let paper = RunConfig::defaults(Recipe::Paper, Task::Push, 2);
     assert_eq!((paper.episodes_per_round(), paper.updates_per_round()), (32, 40));
@@ -59,12 +69,18 @@ fn the_largest_slot_is_one_of_training_or_of_an_evaluation() {
 fn a_run_cools_down_over_its_last_fifth_if_it_has_an_end() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 10_000;
-    let first = (0..100).find(|round| config.is_cooldown(*round));
+    let first = (0..100).find(|round| config.at_round(*round).is_cooldown);
     assert_eq!((config.env_steps_per_round(), first), (800, Some(10)), "8,000 of 10,000");
+    (config.ddpg.actor_learning_rate, config.ddpg.critic_learning_rate) = (3e-3, 4e-3);
+    let rates = [9, 10].map(|round| {
+        let update = config.at_round(round).update;
+        (update.actor_learning_rate, update.critic_learning_rate)
+    });
+    assert_eq!(rates, [(3e-3, 4e-3), (2e-4, 2e-4)]);
     config.ddpg.cooldown_share = 0.0;
-    assert!((0..=12).all(|round| !config.is_cooldown(round)), "no share of it");
+    assert!((0..=12).all(|round| !config.at_round(round).is_cooldown), "no share of it");
     config.stop.max_env_steps = 0;
-    assert!((0..100).all(|round| !config.is_cooldown(round)), "without an end");
+    assert!((0..100).all(|round| !config.at_round(round).is_cooldown), "without an end");
 }
 
 #[test]
@@ -86,25 +102,25 @@ fn evaluations_are_denser_before_the_first_regular_one() {
 fn the_cost_of_a_contact_grows_between_a_tenth_and_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;
-    assert!((0..=100).all(|round| config.contact_cost(round) == 1.0), "a growth of 1");
+    assert!((0..=100).all(|round| config.at_round(round).contact_cost == 1.0), "a growth of 1");
     config.replay.contact_cost_growth = 9.0;
-    let costs = [0, 10, 30, 50, 100].map(|round| config.contact_cost(round));
+    let costs = [0, 10, 30, 50, 100].map(|round| config.at_round(round).contact_cost);
     assert_eq!(costs, [1.0, 1.0, 5.0, 9.0, 9.0], "rounds of 800 steps");
     assert_eq!(config.replay.lowest_reward(), -10.0, "the clip allows the highest cost");
     config.stop.max_env_steps = 0;
-    assert_eq!(config.contact_cost(50), 1.0, "without an end");
+    assert_eq!(config.at_round(50).contact_cost, 1.0, "without an end");
 }
 
 #[test]
 fn advice_is_filtered_from_a_fraction_of_a_run_with_a_limit() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 100 * config.env_steps_per_round();
-    let filtered =
-        |config: &RunConfig| (0..100).filter(|round| config.filters_advice(*round)).count();
+    let filters = |config: &RunConfig, round| config.at_round(round).update.filters_advice;
+    let filtered = |config: &RunConfig| (0..100).filter(|round| filters(config, *round)).count();
     assert_eq!(filtered(&config), 0, "the recipe never filters");
     config.ddpg.bc_filter_start = 0.25;
     assert_eq!(filtered(&config), 75);
-    assert!(config.filters_advice(25) && !config.filters_advice(24));
+    assert!(filters(&config, 25) && !filters(&config, 24));
     config.ddpg.bc_filter_start = 0.0;
     assert_eq!(filtered(&config), 100);
     config.stop.max_env_steps = 0;
@@ -115,12 +131,15 @@ fn advice_is_filtered_from_a_fraction_of_a_run_with_a_limit() {
 fn cloning_fades_over_the_middle_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;
-    assert!((0..=100).all(|round| config.bc_weight(round) == 2.0), "all of it remains");
+    assert!(
+        (0..=100).all(|round| config.at_round(round).update.bc_weight == 2.0),
+        "all of it remains"
+    );
     config.ddpg.bc_final_fraction = 0.25;
-    let weights = [0, 25, 50, 75, 100].map(|round| config.bc_weight(round));
+    let weights = [0, 25, 50, 75, 100].map(|round| config.at_round(round).update.bc_weight);
     assert_eq!(weights, [2.0, 2.0, 1.25, 0.5, 0.5], "rounds of 800 steps");
     config.stop.max_env_steps = 0;
-    assert_eq!(config.bc_weight(50), 2.0, "without an end");
+    assert_eq!(config.at_round(50).update.bc_weight, 2.0, "without an end");
 }
 
 #[test]
@@ -128,12 +147,13 @@ fn the_horizon_of_the_discount_grows_over_the_middle_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;
     config.ddpg.final_discount = 0.0;
-    assert!((0..=100).all(|round| config.discount(round) == config.ddpg.discount), "it stays");
+    let discount = |config: &RunConfig, round| config.at_round(round).update.discount;
+    assert!((0..=100).all(|round| discount(&config, round) == config.ddpg.discount), "it stays");
     (config.ddpg.discount, config.ddpg.final_discount) = (0.5, 0.875);
-    let discounts = [0, 25, 50, 75, 100].map(|round| config.discount(round));
+    let discounts = [0, 25, 50, 75, 100].map(|round| discount(&config, round));
     assert_eq!(discounts, [0.5, 0.5, 0.8, 0.875, 0.875], "horizons of 2, 5 and 8 steps");
     config.stop.max_env_steps = 0;
-    assert_eq!(config.discount(50), 0.5, "without an end");
+    assert_eq!(discount(&config, 50), 0.5, "without an end");
 }
 
 #[test]
@@ -141,10 +161,10 @@ fn greedy_episodes_get_more_over_the_middle_half_of_a_run() {
     let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
     config.stop.max_env_steps = 80_000;
     config.rounds.final_greedy_share = 0.5;
-    let shares = [0, 25, 50, 75, 100].map(|round| config.greedy_share(round));
+    let shares = [0, 25, 50, 75, 100].map(|round| config.at_round(round).greedy_share);
     assert_eq!(shares, [0.0, 0.0, 0.25, 0.5, 0.5], "rounds of 800 steps");
     config.stop.max_env_steps = 0;
-    assert_eq!(config.greedy_share(50), 0.0, "without an end");
+    assert_eq!(config.at_round(50).greedy_share, 0.0, "without an end");
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub struct DdpgConfig {
     pub bc_final_fraction: f32,
     /// Fraction of `stop.max_env_steps` after which advice is cloned only where the critic values it above the actor's
     /// own action, in [0, 1]: the Q-filter of Nair et al. 2018. With a value per arm, the advice to an arm
-    /// is compared by the arm's own value. 1 is never; a run without that limit never filters.
+    /// is compared by the arm's own value. 1 disables the filter, as does a run without that limit.
     #[serde(default = "never")]
     pub bc_filter_start: f32,
     /// Fraction of the old target network that a Polyak step keeps, in [0, 1] (HER reference implementation: 0.95). It
@@ -81,6 +81,21 @@ impl Default for DdpgConfig {
     }
 }
 
+/// The settings of an update that can change during a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpdateSettings {
+    /// Discount per control step, in [0, 1).
+    pub discount: f32,
+    /// Weight of behaviour cloning in the actor's loss, 0 or more.
+    pub bc_weight: f32,
+    /// Whether advice is cloned only where the critic values it above the actor's own action.
+    pub filters_advice: bool,
+    /// Adam's step size for the actor.
+    pub actor_learning_rate: f32,
+    /// Adam's step size for the critic.
+    pub critic_learning_rate: f32,
+}
+
 const fn one_batch() -> usize {
     1
 }
@@ -101,17 +116,26 @@ impl DdpgConfig {
         self.batch_size * self.batches_per_update
     }
 
+    /// Returns the settings of an update without schedules: the initial discount, the whole weight of behaviour
+    /// cloning, no filter of advice and the usual learning rates.
+    #[must_use]
+    pub const fn without_schedules(&self) -> UpdateSettings {
+        UpdateSettings {
+            discount: self.discount,
+            bc_weight: self.bc_weight,
+            filters_advice: false,
+            actor_learning_rate: self.actor_learning_rate,
+            critic_learning_rate: self.critic_learning_rate,
+        }
+    }
+
     /// Checks every range; NaN is in none.
     ///
     /// # Errors
     /// Names the first setting that is out of its range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        for (key, discount) in
-            [("ddpg.discount", self.discount), ("ddpg.final_discount", self.final_discount)]
-        {
-            let is_discount = (0.0..1.0).contains(&discount);
-            OutOfRange::unless(is_discount, key, discount, "a number in [0, 1)")?;
-        }
+        OutOfRange::check_below_one("ddpg.discount", self.discount)?;
+        OutOfRange::check_below_one("ddpg.final_discount", self.final_discount)?;
         for (key, weight) in
             [("ddpg.action_penalty", self.action_penalty), ("ddpg.bc_weight", self.bc_weight)]
         {
@@ -124,8 +148,7 @@ impl DdpgConfig {
             ("ddpg.bc_final_fraction", self.bc_final_fraction),
             ("ddpg.bc_filter_start", self.bc_filter_start),
         ] {
-            let is_fraction = (0.0..=1.0).contains(&fraction);
-            OutOfRange::unless(is_fraction, key, fraction, "a number in [0, 1]")?;
+            OutOfRange::check_fraction(key, fraction)?;
         }
         for (key, rate) in [
             ("ddpg.cooldown_learning_rate", self.cooldown_learning_rate),
@@ -134,13 +157,13 @@ impl DdpgConfig {
         ] {
             OutOfRange::unless((1e-8..=1.0).contains(&rate), key, rate, "1e-8 to 1")?;
         }
-        for (key, size, most, expected) in [
-            ("ddpg.batch_size", self.batch_size, MAX_TRANSITIONS, "1 to 65,536"),
-            ("ddpg.batches_per_update", self.batches_per_update, 64, "1 to 64"),
-            ("ddpg.n_hidden", self.n_hidden, 4096, "1 to 4,096"),
-            ("ddpg.n_hidden_layers", self.n_hidden_layers, 16, "1 to 16"),
+        for (key, size, most) in [
+            ("ddpg.batch_size", self.batch_size, MAX_TRANSITIONS),
+            ("ddpg.batches_per_update", self.batches_per_update, 64),
+            ("ddpg.n_hidden", self.n_hidden, 4096),
+            ("ddpg.n_hidden_layers", self.n_hidden_layers, 16),
         ] {
-            OutOfRange::unless((1..=most).contains(&size), key, size, expected)?;
+            OutOfRange::check_range(key, size, 1..=most)?;
         }
         let most = MAX_TRANSITIONS / self.batch_size;
         let (key, n_batches) = ("ddpg.batches_per_update", self.batches_per_update);

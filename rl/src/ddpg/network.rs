@@ -18,7 +18,7 @@ pub(super) struct Network {
     pub(super) online_weights: TransposedWeights,
     /// The weights in `target`, transposed.
     pub(super) target_weights: TransposedWeights,
-    /// The loss's gradient by `online` in the last update.
+    /// Gradient of the loss with respect to `online` in the last update.
     pub(super) gradient: AlignedVec,
     pub(super) adam: Adam,
     blocks: Vec<ParameterBlock>,
@@ -49,7 +49,10 @@ impl Network {
     }
 
     /// Returns the tasks that compute the gradient and make a step of Adam with it.
-    pub(super) fn step<'a>(&'a mut self, gradient: &'a Gradient<'_>) -> Vec<StepTask<'a>> {
+    pub(super) fn step<'a>(
+        &'a mut self,
+        gradient: &'a ParameterGradientInputs<'_>,
+    ) -> Vec<StepTask<'a>> {
         let lengths = self.blocks.iter().map(|block| block.len(&self.shape));
         let parts = self.adam.step_in_parts(&mut self.online, lengths);
         let mut rest = &mut *self.gradient;
@@ -86,51 +89,64 @@ impl Network {
     }
 }
 
-/// What the gradient of a loss by the parameters of a network is computed from.
+/// The inputs of a parameter gradient: batch, activations and output gradient.
 #[derive(Debug)]
-pub(super) struct Gradient<'a> {
+pub(super) struct ParameterGradientInputs<'a> {
     shape: MlpShape,
     input: Matrix<'a>,
     activations: &'a Activations,
-    /// The loss's gradient by the output, shape `[b, n_output]`.
-    by_output: &'a [f32],
-    is_finite: AtomicBool,
+    /// Gradient of the loss with respect to the output, shape `[b, n_output]`.
+    output_gradient: &'a [f32],
+    /// Set to `false` by the first step that leaves a parameter infinite or NaN.
+    parameters_are_finite: AtomicBool,
 }
 
-impl<'a> Gradient<'a> {
-    /// Describes the gradient after a backward pass over every row of `input`, shape `[b, n_input]`.
+impl<'a> ParameterGradientInputs<'a> {
+    /// Collects the inputs after a backward pass over every row of `input`, shape `[b, n_input]`.
     pub(super) const fn new(
         shape: MlpShape,
         input: Matrix<'a>,
         activations: &'a Activations,
-        by_output: &'a [f32],
+        output_gradient: &'a [f32],
     ) -> Self {
-        Self { shape, input, activations, by_output, is_finite: AtomicBool::new(true) }
+        Self {
+            shape,
+            input,
+            activations,
+            output_gradient,
+            parameters_are_finite: AtomicBool::new(true),
+        }
     }
 
     /// Returns `true` if all parameters are finite after the steps with this gradient.
-    pub(super) fn is_finite(&self) -> bool {
-        self.is_finite.load(Ordering::Relaxed)
+    pub(super) fn parameters_are_finite(&self) -> bool {
+        self.parameters_are_finite.load(Ordering::Relaxed)
     }
 }
 
 /// A step of Adam for a block of parameters.
 #[derive(Debug)]
 pub(super) struct StepTask<'a> {
-    gradient: &'a Gradient<'a>,
+    gradient: &'a ParameterGradientInputs<'a>,
     block: &'a ParameterBlock,
-    /// The gradient by the block's parameters.
+    /// Gradient of the loss with respect to the block's parameters.
     values: &'a mut [f32],
     adam: AdamPart<'a>,
 }
 
 impl StepTask<'_> {
     pub(super) fn run(mut self) {
-        let Gradient { shape, input, activations, by_output, is_finite } = self.gradient;
-        activations.parameter_gradient(shape, self.block, *input, by_output, self.values);
+        let ParameterGradientInputs {
+            shape,
+            input,
+            activations,
+            output_gradient,
+            parameters_are_finite,
+        } = self.gradient;
+        activations.parameter_gradient(shape, self.block, *input, output_gradient, self.values);
         self.adam.apply(self.values);
         if !all_finite(self.adam.parameters()) {
-            is_finite.store(false, Ordering::Relaxed);
+            parameters_are_finite.store(false, Ordering::Relaxed);
         }
     }
 }

@@ -65,10 +65,11 @@ impl Ddpg {
     /// Returns the critic's inputs and targets in the last update.
     #[must_use]
     pub fn critic_batch(&self) -> CriticBatch<'_> {
-        CriticBatch { inputs: &self.critic_half.input, targets: &self.critic_half.targets }
+        CriticBatch { inputs: &self.critic_update.input, targets: &self.critic_update.targets }
     }
 
-    /// Returns the gradients of the losses by the parameters in the last update: the actor's and the critic's.
+    /// Returns the gradients of the losses with respect to the parameters in the last update: the actor's and the
+    /// critic's.
     #[must_use]
     pub fn gradients(&self) -> [&[f32]; 2] {
         [&self.actor.gradient, &self.critic.gradient]

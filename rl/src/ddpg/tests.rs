@@ -4,9 +4,11 @@ use tandem_core::rng::{index, uniform};
 use tandem_core::{Layout, Stream, Task, episode_rng};
 use tandem_policy::MlpShape;
 
-use super::actor_half::QFilter;
-use super::critic_half::critic_target;
-use super::{Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses, heads_of_actions};
+use super::actor_update::QFilter;
+use super::critic_update::critic_target;
+use super::{
+    Batch, Ddpg, DdpgConfig, DdpgError, Rewards, UpdateLosses, UpdateSettings, heads_of_actions,
+};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
@@ -34,6 +36,11 @@ fn random_batch(n_heads: usize, batch_size: usize, number: u64) -> Batch {
         row.fill(if index(&mut rng, 2) == 0 { 1.0 } else { 0.0 });
     }
     batch
+}
+
+/// Makes an update without schedules.
+fn update(ddpg: &mut Ddpg, batch: &Batch) -> Result<UpdateLosses, DdpgError> {
+    ddpg.update(ddpg.config().without_schedules(), batch)
 }
 
 fn exact(numbers: &[f32]) -> Vec<f64> {
@@ -83,7 +90,7 @@ fn critic_loss(ddpg: &Ddpg, critic: &[f64], batch: &Batch) -> f64 {
     loss
 }
 
-fn actor_loss(ddpg: &Ddpg, actor: &[f64], batch: &Batch) -> f64 {
+fn actor_loss(ddpg: &Ddpg, filters_advice: bool, actor: &[f64], batch: &Batch) -> f64 {
     let (actor_shape, critic) = (ddpg.actor_shape(), exact(ddpg.critic()));
     let config = ddpg.config();
     let b = config.batch_size as f64;
@@ -95,7 +102,7 @@ fn actor_loss(ddpg: &Ddpg, actor: &[f64], batch: &Batch) -> f64 {
     let is_cloned = |row: usize, input: &[f64]| {
         let executed = exact(&batch.actions[row * 3..row * 3 + 3]);
         let own = policy(actor_shape, &exact(ddpg.actor()), input);
-        !ddpg.filters_advice || value(input, &executed) > value(input, &own)
+        !filters_advice || value(input, &executed) > value(input, &own)
     };
     let mut loss = 0.0;
     for (row, input) in exact(&batch.inputs).chunks(actor_shape.n_input).enumerate() {
@@ -134,13 +141,13 @@ fn assert_is_gradient(what: &str, gradient: &[f32], at: &[f32], loss: impl Fn(&[
 fn both_gradients_agree_with_finite_differences() {
     let check = |n_heads, filters_advice, change: fn(&mut DdpgConfig)| {
         let mut ddpg = Ddpg::new(small(change), LAYOUT, Rewards::sparse(n_heads), 4);
-        ddpg.set_bc_filter(filters_advice);
+        let settings = UpdateSettings { filters_advice, ..ddpg.config().without_schedules() };
         let batch = random_batch(n_heads, 5, 0);
         let before = ddpg.clone();
-        let losses = ddpg.update(&batch).unwrap();
+        let losses = ddpg.update(settings, &batch).unwrap();
         let [actor, critic] = ddpg.gradients();
         let by_critic = |critic: &[f64]| critic_loss(&before, critic, &batch);
-        let by_actor = |actor: &[f64]| actor_loss(&before, actor, &batch);
+        let by_actor = |actor: &[f64]| actor_loss(&before, filters_advice, actor, &batch);
         assert!((losses.critic_loss - by_critic(&exact(before.critic()))).abs() < 1e-5);
         assert!((losses.actor_loss - by_actor(&exact(before.actor()))).abs() < 1e-5);
         assert_is_gradient("critic", critic, before.critic(), by_critic);
@@ -181,10 +188,11 @@ fn learn(
     let n_rows = config.transitions_per_update();
     let mut ddpg = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(n_heads), 9);
     ddpg.set_threads(n_threads);
-    ddpg.set_bc_filter(config.bc_weight > 0.0);
+    let filters_advice = config.bc_weight > 0.0;
+    let settings = UpdateSettings { filters_advice, ..config.without_schedules() };
     let mut losses = Vec::new();
     for number in 0..4 {
-        losses.push(ddpg.update(&random_batch(n_heads, n_rows, number)).unwrap());
+        losses.push(ddpg.update(settings, &random_batch(n_heads, n_rows, number)).unwrap());
         ddpg.polyak();
     }
     (ddpg.state().map(|(name, vector)| (name, vector.to_vec())).to_vec(), losses)
@@ -240,11 +248,11 @@ fn the_gradients_of_an_updates_batches_are_summed_and_its_losses_averaged() {
     let batches = [random_batch(1, 5, 0), random_batch(1, 5, 1)];
     let alone = [0, 1].map(|idx| {
         let mut ddpg = with(1);
-        let losses = ddpg.update(&batches[idx]).unwrap();
+        let losses = update(&mut ddpg, &batches[idx]).unwrap();
         (ddpg.gradients().map(<[f32]>::to_vec), losses)
     });
     let mut together = with(2);
-    let losses = together.update(&joined(&batches[0], &batches[1])).unwrap();
+    let losses = update(&mut together, &joined(&batches[0], &batches[1])).unwrap();
     for (network, gradient) in together.gradients().iter().enumerate() {
         let parts = alone[0].0[network].iter().zip(&alone[1].0[network]);
         for (got, (first, second)) in gradient.iter().zip(parts) {
@@ -265,8 +273,8 @@ fn the_gradients_of_an_updates_batches_are_summed_and_its_losses_averaged() {
 fn the_critic_fits_a_fixed_target() {
     let mut ddpg = Ddpg::new(small(|config| config.n_hidden = 32), LAYOUT, Rewards::sparse(1), 1);
     let batch = random_batch(1, 5, 0);
-    let first = ddpg.update(&batch).unwrap().critic_loss;
-    let last = (0..200).map(|_| ddpg.update(&batch).unwrap().critic_loss).last().unwrap();
+    let first = update(&mut ddpg, &batch).unwrap().critic_loss;
+    let last = (0..200).map(|_| update(&mut ddpg, &batch).unwrap().critic_loss).last().unwrap();
     assert!(last < 1e-3 * first, "the target is fixed, the loss went from {first} to {last}");
 }
 
@@ -274,7 +282,7 @@ fn the_critic_fits_a_fixed_target() {
 fn polyak_averaging_moves_only_the_targets() {
     let mut ddpg =
         Ddpg::new(small(|config| config.polyak_keep = 0.5), LAYOUT, Rewards::sparse(1), 1);
-    ddpg.update(&random_batch(1, 5, 0)).unwrap();
+    update(&mut ddpg, &random_batch(1, 5, 0)).unwrap();
     let before = ddpg.clone();
     ddpg.polyak();
     assert_eq!((ddpg.actor(), ddpg.critic()), (before.actor(), before.critic()));
@@ -302,34 +310,36 @@ fn a_restored_learner_continues_with_the_same_bits() {
     let config = small(|_| {});
     let mut first = Ddpg::new(config.clone(), LAYOUT, Rewards::sparse(2), 1);
     for number in 0..3 {
-        first.update(&random_batch(2, 5, number)).unwrap();
+        update(&mut first, &random_batch(2, 5, number)).unwrap();
         first.polyak();
     }
     let stored = first.state().map(|(name, vector)| (name.to_owned(), vector.to_vec()));
     let mut second = Ddpg::new(config, LAYOUT, Rewards::sparse(2), 2);
     second.restore(&stored, first.n_updates()).unwrap();
     let batch = random_batch(2, 5, 3);
-    assert_eq!(first.update(&batch), second.update(&batch));
+    assert_eq!(update(&mut first, &batch), update(&mut second, &batch));
     assert_eq!(first.state(), second.state());
     assert_eq!(second.n_updates(), 4);
 }
 
 #[test]
-fn a_cooldown_changes_only_the_learning_rate() {
+fn the_learning_rates_of_an_update_are_those_of_its_settings() {
     let batch = random_batch(2, 5, 0);
-    let cooled = |usual: f32, is_cooldown| {
+    let learned = |initial: f32, rate: f32| {
         let config = small(|config| {
-            config.actor_learning_rate = usual;
-            config.critic_learning_rate = usual;
-            config.cooldown_learning_rate = 1e-4;
+            (config.actor_learning_rate, config.critic_learning_rate) = (initial, initial);
         });
+        let settings = UpdateSettings {
+            actor_learning_rate: rate,
+            critic_learning_rate: rate,
+            ..config.without_schedules()
+        };
         let mut ddpg = Ddpg::new(config, LAYOUT, Rewards::sparse(2), 1);
-        ddpg.set_cooldown(is_cooldown);
-        ddpg.update(&batch).unwrap();
+        ddpg.update(settings, &batch).unwrap();
         ddpg.state().map(|(_, vector)| vector.to_vec())
     };
-    assert_eq!(cooled(1e-3, true), cooled(1e-4, false));
-    assert_ne!(cooled(1e-3, false), cooled(1e-4, false));
+    assert_eq!(learned(1e-3, 1e-4), learned(1e-4, 1e-4));
+    assert_ne!(learned(1e-3, 1e-4), learned(1e-3, 1e-3));
 }
 
 #[test]
@@ -354,7 +364,7 @@ fn non_finite_numbers_are_errors() {
         let mut ddpg = Ddpg::new(small(|_| {}), LAYOUT, Rewards::sparse(1), 1);
         let mut batch = random_batch(1, 5, 0);
         spoil(&mut batch);
-        assert_eq!(ddpg.update(&batch), Err(DdpgError::NotFinite { what, update: 1 }));
+        assert_eq!(update(&mut ddpg, &batch), Err(DdpgError::NotFinite { what, update: 1 }));
     };
     check(|batch| batch.rewards[4] = f32::NAN, "a critic loss");
     check(|batch| batch.actions[0] = f32::INFINITY, "a critic loss");

@@ -107,20 +107,17 @@ impl ReplayConfig {
             ("replay.reflection_prob", self.reflection_prob),
         ];
         for (key, value) in fractions {
-            let is_fraction = (0.0..=1.0).contains(&value);
-            OutOfRange::unless(is_fraction, key, value, "a number in [0, 1]")?;
+            OutOfRange::check_fraction(key, value)?;
         }
         let (key, tolerance_m) = ("replay.goal_tolerance_m", self.goal_tolerance_m);
         if layout.as_built_in().is_some() {
-            let is_tolerance = (1e-4..=1.0).contains(&tolerance_m);
-            OutOfRange::unless(is_tolerance, key, tolerance_m, "0.0001 to 1")?;
+            OutOfRange::check_range(key, tolerance_m, 1e-4..=1.0)?;
         }
         let is_tolerance = tolerance_m.is_finite() && tolerance_m > 0.0;
         OutOfRange::unless(is_tolerance, key, tolerance_m, "a finite number above 0")?;
-        let (key, cost) = ("replay.contact_cost", self.contact_cost);
-        OutOfRange::unless((0.0..=100.0).contains(&cost), key, cost, "0 to 100")?;
+        OutOfRange::check_range("replay.contact_cost", self.contact_cost, 0.0..=100.0)?;
         let (key, growth) = ("replay.contact_cost_growth", self.contact_cost_growth);
-        OutOfRange::unless((1.0..=100.0).contains(&growth), key, growth, "1 to 100")?;
+        OutOfRange::check_range(key, growth, 1.0..=100.0)?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
         let n_max = layout.episode_steps();
         OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;

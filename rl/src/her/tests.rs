@@ -115,7 +115,7 @@ fn rewards_match_the_sampled_goal() {
 
 #[test]
 fn fractions_are_as_configured() {
-    let count = |reward, holds: fn(&Relabelled) -> bool| {
+    let count = |reward, holds: fn(&SampledTransition) -> bool| {
         let hits = std::cell::Cell::new(0_usize);
         sampled(reward, |sampler, _| hits.set(hits.get() + usize::from(holds(&sampler.sample))));
         hits.get() as f64 / N_DRAWS as f64
@@ -129,7 +129,7 @@ fn fractions_are_as_configured() {
         count(RewardKind::PerArm, |drawn| drawn.steps[0].episode_idx == 0 && drawn.goal[0] < 9.0),
         0.6,
     );
-    let one_arm_only = |drawn: &Relabelled| {
+    let one_arm_only = |drawn: &SampledTransition| {
         drawn.steps[0].episode_idx == 0 && (drawn.goal[0] < 9.0) != (drawn.goal[3] < 9.0)
     };
     near(count(RewardKind::PerArm, one_arm_only), 0.75 * 2.0 * 0.8 * 0.2);
@@ -350,7 +350,7 @@ fn arms_that_share_an_object_get_the_goals_of_one_later_step_after_which_it_has_
     let mut n_hindsight = 0;
     for _ in 0..N_DRAWS {
         sampler.sample_transition(&buffer, &mut rng);
-        let Relabelled { steps, goal, keeps_goal, .. } = &sampler.sample;
+        let SampledTransition { steps, goal, keeps_goal, .. } = &sampler.sample;
         assert_eq!((steps[0], keeps_goal[0]), (steps[1], keeps_goal[1]));
         if keeps_goal[0] {
             assert_eq!(*goal, [9.0; 6]);

@@ -13,7 +13,7 @@ impl Trainer {
         let per_round = self.config.episodes_per_round();
         let warmup_env_steps = self.config.rounds.warmup_env_steps;
         let warmup_episodes = warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
-        let greedy_share = self.config.greedy_share(round);
+        let greedy_share = self.config.at_round(round).greedy_share;
         let n_rounds_ahead = round.saturating_sub(self.counters.round);
         let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));
         let asks = self.config.advice.asks() && advised_steps != Some(0);

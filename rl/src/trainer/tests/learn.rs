@@ -86,7 +86,7 @@ const SCHEDULES: [Schedule; 5] = [
         first_round: 3,
         schedule: |config| config.ddpg.final_discount = 0.98,
         freeze: |config, round| {
-            config.ddpg.discount = config.discount(round);
+            config.ddpg.discount = config.at_round(round).update.discount;
             config.ddpg.final_discount = 0.0;
         },
     },
@@ -95,7 +95,7 @@ const SCHEDULES: [Schedule; 5] = [
         first_round: 3,
         schedule: |config| config.ddpg.bc_final_fraction = 0.0,
         freeze: |config, round| {
-            config.ddpg.bc_weight = config.bc_weight(round);
+            config.ddpg.bc_weight = config.at_round(round).update.bc_weight;
             config.ddpg.bc_final_fraction = 1.0;
         },
     },
@@ -110,7 +110,7 @@ const SCHEDULES: [Schedule; 5] = [
         first_round: 1,
         schedule: |config| config.replay.contact_cost_growth = 4.0,
         freeze: |config, round| {
-            config.replay.contact_cost = config.contact_cost(round);
+            config.replay.contact_cost = config.at_round(round).contact_cost;
             config.replay.contact_cost_growth = 1.0;
         },
     },

@@ -1,32 +1,33 @@
-//! The actor's half of an update.
+//! The actor's part of an update.
 
 use std::ops::Range;
 
 use tandem_policy::{Activations, Matrix, MatrixMut, MlpShape, RowBlock};
 
-use super::network::{Gradient, Network};
+use super::network::ParameterGradientInputs;
 use super::{
-    Batch, BatchRows, DdpgConfig, Scratch, Sizes, action_columns, split_rows, squash, write_columns,
+    Batch, BatchRows, DdpgConfig, Pass, Scratch, Sizes, action_columns, split_rows, squash,
+    write_columns,
 };
 
-/// The actor's half of an update.
+/// The actor's part of an update: its batch, values and gradients.
 #[derive(Debug, Clone)]
-pub(super) struct ActorHalf {
+pub(super) struct ActorUpdate {
     /// Input and the actor's action, shape `[b, n_input + n_action]`.
     input: Vec<f32>,
     /// The critic's value of it, shape `[b, n_heads]`.
     q: Vec<f32>,
-    /// The loss's gradient by `q`: the same number everywhere.
+    /// Gradient of the loss with respect to `q`: the same number everywhere.
     q_gradient: Vec<f32>,
-    /// The loss's gradient by the action, then by the action before its tanh, shape `[b, n_action]`.
+    /// Gradient of the loss with respect to the action, then to the action before its tanh, shape `[b, n_action]`.
     action_gradient: Vec<f32>,
-    /// The batch's mask of behaviour cloning, without what the filter leaves out, shape `[b, n_action]`.
+    /// The batch's mask of behaviour cloning without the components that the filter leaves out, shape `[b, n_action]`.
     bc_mask: Vec<f32>,
-    /// Of the actions.
+    /// The actor's activations for its actions.
     activations: Activations,
 }
 
-/// Some rows of the actor's half.
+/// Consecutive rows of [`ActorUpdate`].
 #[derive(Debug)]
 pub(super) struct ActorRows<'a> {
     batch: BatchRows<'a>,
@@ -38,7 +39,7 @@ pub(super) struct ActorRows<'a> {
     activations: RowBlock<'a>,
 }
 
-impl ActorHalf {
+impl ActorUpdate {
     pub(super) fn new(config: &DdpgConfig, actor: &MlpShape, critic: &MlpShape) -> Self {
         let b = config.transitions_per_update();
         Self {
@@ -51,7 +52,7 @@ impl ActorHalf {
         }
     }
 
-    /// Splits the half into blocks of rows.
+    /// Splits all vectors into blocks of rows.
     pub(super) fn rows<'a>(
         &'a mut self,
         batch: &'a Batch,
@@ -79,28 +80,35 @@ impl ActorHalf {
         rows.collect()
     }
 
-    /// Describes the gradient of the loss by the actor's parameters, after all `b` rows of `batch`.
-    pub(super) fn gradient<'a>(
+    /// Returns the inputs of the gradient with respect to the actor's parameters, after all `b` rows of `batch`.
+    pub(super) fn gradient_inputs<'a>(
         &'a self,
         actor: &MlpShape,
         batch: &'a Batch,
         b: usize,
-    ) -> Gradient<'a> {
+    ) -> ParameterGradientInputs<'a> {
         let input = Matrix::new(&batch.inputs, b, actor.n_input);
-        Gradient::new(*actor, input, &self.activations, &self.action_gradient)
+        ParameterGradientInputs::new(*actor, input, &self.activations, &self.action_gradient)
     }
 
     /// Returns the loss and the mean value, after all rows of `batch`.
-    pub(super) fn loss_and_mean_q(&self, config: &DdpgConfig, batch: &Batch) -> (f64, f64) {
+    pub(super) fn loss_and_mean_q(
+        &self,
+        config: &DdpgConfig,
+        bc_weight: f32,
+        batch: &Batch,
+    ) -> (f64, f64) {
         let b = config.transitions_per_update();
         let n_action = self.action_gradient.len() / b;
-        let n_joined = self.input.len() / b;
-        let terms = ActionTerms::new(config, n_action);
+        let n_state_action = self.input.len() / b;
+        let terms = ActionTerms::new(config, bc_weight, n_action);
         let executed_rows =
             batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let mut loss = 0.0;
-        for (input, (executed, bc_mask)) in self.input.chunks_exact(n_joined).zip(executed_rows) {
-            let actions = &input[n_joined - n_action..];
+        for (input, (executed, bc_mask)) in
+            self.input.chunks_exact(n_state_action).zip(executed_rows)
+        {
+            let actions = &input[n_state_action - n_action..];
             for ((action, executed), bc_mask) in actions.iter().zip(executed).zip(bc_mask) {
                 loss += terms.loss(*action, bc_mask * (action - executed));
             }
@@ -112,23 +120,22 @@ impl ActorHalf {
 }
 
 impl ActorRows<'_> {
-    /// Computes the actions, their values and the gradients of the actor's loss by all activations of the actor. Advice is
-    /// cloned where `filter` keeps it.
+    /// Computes the actions, their values and the gradients of the actor's loss with respect to all activations of the
+    /// actor. Advice is cloned where `filter` keeps it.
     pub(super) fn differentiate(
         mut self,
         filter: Option<QFilter<'_>>,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
+        pass: Pass<'_>,
         scratch: &mut Scratch,
     ) {
+        let Pass { config, settings, actor, critic } = pass;
         let BatchRows { n_rows, inputs, .. } = self.batch;
         let n_input = actor.shape.n_input;
-        let (n_joined, n_heads) = (critic.shape.n_input, critic.shape.n_output);
+        let (n_state_action, n_heads) = (critic.shape.n_input, critic.shape.n_output);
 
         // Q(s, pi(s)): the actor writes its actions into the critic's input.
-        write_columns(self.input, n_joined, 0, inputs, n_input);
-        let mut action_columns = action_columns(self.input, &actor.shape, n_joined, n_rows);
+        write_columns(self.input, n_state_action, 0, inputs, n_input);
+        let mut action_columns = action_columns(self.input, &actor.shape, n_state_action, n_rows);
         self.activations.forward(
             &actor.shape,
             &actor.online,
@@ -142,7 +149,7 @@ impl ActorRows<'_> {
             &critic.shape,
             &critic.online,
             &critic.online_weights,
-            Matrix::new(self.input, n_rows, n_joined),
+            Matrix::new(self.input, n_rows, n_state_action),
             &mut MatrixMut::new(self.q, n_rows, n_heads),
         );
 
@@ -151,24 +158,24 @@ impl ActorRows<'_> {
             filter.apply(self.q, self.bc_mask);
         }
 
-        // -Q summed over the heads, by the action.
+        // The gradient of -Q, summed over the heads, with respect to the action.
         values.backward(&critic.shape, &critic.online, self.q_gradient);
         values.input_gradient(
             &critic.shape,
             &critic.online,
             self.q_gradient,
-            n_input..n_joined,
+            n_input..n_state_action,
             self.action_gradient,
         );
-        self.add_action_terms(config, n_input);
+        self.add_action_terms(config, settings.bc_weight, n_input);
         self.activations.backward(&actor.shape, &actor.online, self.action_gradient);
     }
 
     /// Adds the gradient of the terms of the loss that depend on the action directly, and propagates the gradient back
     /// through the tanh.
-    fn add_action_terms(&mut self, config: &DdpgConfig, n_input: usize) {
+    fn add_action_terms(&mut self, config: &DdpgConfig, bc_weight: f32, n_input: usize) {
         let n_action = self.action_gradient.len() / self.batch.n_rows;
-        let terms = ActionTerms::new(config, n_action);
+        let terms = ActionTerms::new(config, bc_weight, n_action);
         let executed_rows =
             self.batch.actions.chunks_exact(n_action).zip(self.bc_mask.chunks_exact(n_action));
         let rows = self
@@ -225,10 +232,10 @@ struct ActionTerms {
 }
 
 impl ActionTerms {
-    fn new(config: &DdpgConfig, n_action: usize) -> Self {
+    fn new(config: &DdpgConfig, bc_weight: f32, n_action: usize) -> Self {
         Self {
             penalty: config.action_penalty / (config.batch_size * n_action) as f32,
-            cloning: config.bc_weight / config.batch_size as f32,
+            cloning: bc_weight / config.batch_size as f32,
         }
     }
 

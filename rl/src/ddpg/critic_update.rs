@@ -1,17 +1,18 @@
-//! The critic's half of an update.
+//! The critic's part of an update.
 
 use std::ops::Range;
 
 use tandem_policy::{Activations, Matrix, MatrixMut, MlpShape, RowBlock};
 
-use super::network::{Gradient, Network};
+use super::network::ParameterGradientInputs;
 use super::{
-    Batch, BatchRows, DdpgConfig, Scratch, Sizes, action_columns, split_rows, squash, write_columns,
+    Batch, BatchRows, DdpgConfig, Pass, Scratch, Sizes, action_columns, split_rows, squash,
+    write_columns,
 };
 
-/// The critic's half of an update.
+/// The critic's part of an update: its batch, values and gradients.
 #[derive(Debug, Clone)]
-pub(super) struct CriticHalf {
+pub(super) struct CriticUpdate {
     /// The lowest reward of a step.
     lowest_reward: f32,
     /// Input and executed action, shape `[b, n_input + n_action]`.
@@ -22,13 +23,13 @@ pub(super) struct CriticHalf {
     q: Vec<f32>,
     /// The targets of `q`, shape `[b, n_heads]`.
     pub(super) targets: Vec<f32>,
-    /// The loss's gradient by `q`.
+    /// Gradient of the loss with respect to `q`.
     q_gradient: Vec<f32>,
-    /// Of the values of the executed actions.
+    /// The critic's activations for the executed actions.
     activations: Activations,
 }
 
-/// Some rows of the critic's half.
+/// Consecutive rows of [`CriticUpdate`].
 #[derive(Debug)]
 pub(super) struct CriticRows<'a> {
     lowest_reward: f32,
@@ -41,7 +42,7 @@ pub(super) struct CriticRows<'a> {
     activations: RowBlock<'a>,
 }
 
-impl CriticHalf {
+impl CriticUpdate {
     pub(super) fn new(config: &DdpgConfig, lowest_reward: f32, critic: &MlpShape) -> Self {
         let b = config.transitions_per_update();
         Self {
@@ -55,7 +56,7 @@ impl CriticHalf {
         }
     }
 
-    /// Splits the half into blocks of rows.
+    /// Splits all vectors into blocks of rows.
     pub(super) fn rows<'a>(
         &'a mut self,
         batch: &'a Batch,
@@ -63,9 +64,9 @@ impl CriticHalf {
         sizes: Sizes,
     ) -> Vec<CriticRows<'a>> {
         let Self { lowest_reward, input, next_input, q, targets, q_gradient, activations } = self;
-        let n_joined = sizes.n_input + sizes.n_action;
-        let mut inputs = split_rows(input, n_joined, blocks);
-        let mut next_inputs = split_rows(next_input, n_joined, blocks);
+        let n_state_action = sizes.n_input + sizes.n_action;
+        let mut inputs = split_rows(input, n_state_action, blocks);
+        let mut next_inputs = split_rows(next_input, n_state_action, blocks);
         let mut qs = split_rows(q, sizes.n_heads, blocks);
         let mut all_targets = split_rows(targets, sizes.n_heads, blocks);
         let mut q_gradients = split_rows(q_gradient, sizes.n_heads, blocks);
@@ -85,10 +86,14 @@ impl CriticHalf {
         rows.collect()
     }
 
-    /// Describes the gradient of the loss by the critic's parameters, after all `b` rows.
-    pub(super) fn gradient(&self, critic: &MlpShape, b: usize) -> Gradient<'_> {
+    /// Returns the inputs of the gradient with respect to the critic's parameters, after all `b` rows.
+    pub(super) fn gradient_inputs(
+        &self,
+        critic: &MlpShape,
+        b: usize,
+    ) -> ParameterGradientInputs<'_> {
         let input = Matrix::new(&self.input, b, critic.n_input);
-        Gradient::new(*critic, input, &self.activations, &self.q_gradient)
+        ParameterGradientInputs::new(*critic, input, &self.activations, &self.q_gradient)
     }
 
     /// Returns the loss, the mean of `(q - targets)^2` over the `b` rows.
@@ -103,23 +108,19 @@ impl CriticHalf {
 }
 
 impl<'a> CriticRows<'a> {
-    /// Computes the values, their targets and the gradients of the critic's loss by all activations. Returns the values
-    /// of the executed actions, shape `[n_rows, n_heads]`.
-    pub(super) fn differentiate(
-        mut self,
-        config: &DdpgConfig,
-        actor: &Network,
-        critic: &Network,
-        scratch: &mut Scratch,
-    ) -> &'a [f32] {
+    /// Computes the values, their targets and the gradients of the critic's loss with respect to all activations.
+    /// Returns the values of the executed actions, shape `[n_rows, n_heads]`.
+    pub(super) fn differentiate(mut self, pass: Pass<'_>, scratch: &mut Scratch) -> &'a [f32] {
+        let Pass { config, settings, actor, critic } = pass;
         let BatchRows { n_rows, inputs, actions, rewards, next_inputs, .. } = self.batch;
         let (n_input, n_action) = (actor.shape.n_input, actor.shape.n_output);
-        let (n_joined, n_heads) = (critic.shape.n_input, critic.shape.n_output);
+        let (n_state_action, n_heads) = (critic.shape.n_input, critic.shape.n_output);
 
         // Q'(s', pi'(s')): the target actor writes its actions into the target critic's input.
-        write_columns(self.next_input, n_joined, 0, next_inputs, n_input);
+        write_columns(self.next_input, n_state_action, 0, next_inputs, n_input);
         let next_inputs = Matrix::new(next_inputs, n_rows, n_input);
-        let mut action_columns = action_columns(self.next_input, &actor.shape, n_joined, n_rows);
+        let mut action_columns =
+            action_columns(self.next_input, &actor.shape, n_state_action, n_rows);
         scratch.actor.block(n_rows).forward(
             &actor.shape,
             &actor.target,
@@ -132,21 +133,21 @@ impl<'a> CriticRows<'a> {
             &critic.shape,
             &critic.target,
             &critic.target_weights,
-            Matrix::new(self.next_input, n_rows, n_joined),
+            Matrix::new(self.next_input, n_rows, n_state_action),
             &mut MatrixMut::new(self.targets, n_rows, n_heads),
         );
         for (target, reward) in self.targets.iter_mut().zip(rewards) {
-            *target = critic_target(config.discount, self.lowest_reward, *reward, *target);
+            *target = critic_target(settings.discount, self.lowest_reward, *reward, *target);
         }
 
         // Q(s, a)
-        write_columns(self.input, n_joined, 0, inputs, n_input);
-        write_columns(self.input, n_joined, n_input, actions, n_action);
+        write_columns(self.input, n_state_action, 0, inputs, n_input);
+        write_columns(self.input, n_state_action, n_input, actions, n_action);
         self.activations.forward(
             &critic.shape,
             &critic.online,
             &critic.online_weights,
-            Matrix::new(self.input, n_rows, n_joined),
+            Matrix::new(self.input, n_rows, n_state_action),
             &mut MatrixMut::new(self.q, n_rows, n_heads),
         );
 
