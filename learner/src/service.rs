@@ -30,7 +30,7 @@ use crate::error::Error;
 use crate::metrics;
 use crate::progress::RunEnd;
 use crate::runtime::{Runtime, on_a_thread};
-use crate::shared::{LearnerConfig, Shared};
+use crate::shared::{LearnerConfig, Shared, State};
 use crate::timings::Timings;
 use crate::training_loop::{self, Context, RunOutcome};
 use crate::view;
@@ -122,10 +122,11 @@ fn serve_boxed(
         let serving_metrics = serve_metrics(options.metrics, page);
         let publishing = view::publish(options.views, shared.clone(), config.run.clone());
         let learning = {
-            let (pacing, stop) = (config.pacing, stop_serving.clone());
-            let shutdown = shutdown.clone();
+            // Also dropped if the thread cannot be started.
+            let stop = stop_serving.clone().drop_guard();
+            let (pacing, shutdown) = (config.pacing, shutdown.clone());
             on_a_thread("learn", pacing, move |runtime| {
-                let _stop = stop.drop_guard();
+                let _stop = stop;
                 let outcome = learn(&config, &shared, &runtime, &shutdown);
                 runtime.wait_on(linger(options.linger));
                 if is_complete(&outcome) {
@@ -249,7 +250,7 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
-        let hangup = ConnectionClosed::from_extensions(request.extensions());
+        let closed = ConnectionClosed::from_extensions(request.extensions());
         let pb::JoinRequest { worker: name, version } = request.into_inner();
         check_name(&name)?;
         check_version(&name, &version, "learner")?;
@@ -257,13 +258,10 @@ impl Learner for LearnerService {
         let mut state = self.shared.lock();
         let terms =
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
-        let connection = hangup.as_ref().map(|hangup| state.connections.register(hangup));
-        if let (Some(hangup), Some((number, true))) = (hangup, connection) {
-            tokio::spawn(requeue_when_closed(self.shared.clone(), number, hangup));
-        }
+        let connection = closed.map(|closed| self.register(&mut state, closed));
         let worker_id = state
             .queue
-            .join(name.clone(), connection.map(|(number, _)| number), now)
+            .join(name.clone(), connection, now)
             .map_err(|error| Status::resource_exhausted(error.to_string()))?;
         let decision = state.join_lines.count(now);
         drop(state);
@@ -281,7 +279,11 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::NextWorkRequest>,
     ) -> Result<Response<pb::NextWorkResponse>, Status> {
+        let closed = ConnectionClosed::from_extensions(request.extensions());
         let worker_id = request.into_inner().worker_id;
+        if let Some(closed) = closed {
+            self.attach(worker_id, closed);
+        }
         let search = async {
             loop {
                 let notified = self.shared.work.notified();
@@ -341,6 +343,24 @@ impl Learner for LearnerService {
 use pb::next_work_response::Work;
 
 impl LearnerService {
+    /// Returns the number of a connection. The slots of its workers return to the queue when it closes.
+    fn register(&self, state: &mut State, closed: ConnectionClosed) -> u64 {
+        let (number, is_new) = state.connections.register(&closed);
+        if is_new {
+            tokio::spawn(requeue_when_closed(self.shared.clone(), number, closed));
+        }
+        number
+    }
+
+    /// Attaches a worker that calls again after its connection has ended to its new connection.
+    fn attach(&self, worker_id: u64, closed: ConnectionClosed) {
+        let mut state = self.shared.lock();
+        if state.queue.worker(worker_id).is_some_and(|worker| worker.connection.is_none()) {
+            let connection = self.register(&mut state, closed);
+            state.queue.attach(worker_id, connection);
+        }
+    }
+
     /// Returns the work for a worker, and the time after which to retry if there is none.
     fn work_for(&self, worker_id: u64) -> Result<(Option<Work>, Duration), Status> {
         let now = (self.shared.clock)();
@@ -355,9 +375,28 @@ impl LearnerService {
         Ok((order.map(|order| Work::Slot(encode_slot(&order))), retry_in))
     }
 
-    /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored.
+    /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored, the
+    /// report on environments that comes with them is not: the worker sends it once.
     fn submit(&self, request: pb::SubmitEpisodesRequest) -> Result<(), Status> {
         let pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check } = request;
+        let is_new = self.accept(worker_id, slot, episodes)?;
+        let is_new_report = self.shared.lock().queue.is_new_report(worker_id, slot);
+        if (is_new || is_new_report)
+            && let Some(check) = environment_check
+        {
+            self.shared.record_environment_check(&check);
+        }
+        self.shared.arrived.notify_one();
+        Ok(())
+    }
+
+    /// Accepts a slot's episodes; returns false if they were submitted before.
+    fn accept(
+        &self,
+        worker_id: u64,
+        slot: u64,
+        episodes: Vec<pb::Episode>,
+    ) -> Result<bool, Status> {
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let terms =
@@ -366,7 +405,7 @@ impl LearnerService {
         let worker = state.queue.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
         let refused = |error| refusal(&error, worker.as_ref());
         let Some(order) = state.queue.order_of(worker_id, slot, now).map_err(refused)? else {
-            return Ok(());
+            return Ok(false);
         };
         check_count(order, episodes.len()).map_err(refused)?;
         // Decoding takes a while, so the lock is released for other calls.
@@ -377,13 +416,6 @@ impl LearnerService {
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
-        let is_new = self.shared.lock().queue.submit(worker_id, slot, episodes, now);
-        if is_new.map_err(refused)?
-            && let Some(check) = environment_check
-        {
-            self.shared.record_environment_check(&check);
-        }
-        self.shared.arrived.notify_one();
-        Ok(())
+        self.shared.lock().queue.submit(worker_id, slot, episodes, now).map_err(refused)
     }
 }

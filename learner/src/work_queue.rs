@@ -5,6 +5,7 @@
 //! twice and counts once.
 
 mod check;
+mod connections;
 mod worker;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -15,6 +16,7 @@ use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
 pub use check::{SubmitError, check_count};
 use check::{check, check_claims};
+use connections::Connection;
 pub use worker::{SilentWorker, Worker};
 
 /// A worker that has not called for this time counts as dead: its slots return to the queue.
@@ -64,15 +66,6 @@ struct Assignment {
     since: Duration,
 }
 
-/// An open connection.
-#[derive(Debug, Default)]
-struct Connection {
-    /// The workers that joined over it.
-    workers: BTreeSet<u64>,
-    /// The number of these that have delivered no episodes.
-    n_unproven: usize,
-}
-
 /// A refusal of a join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum JoinError {
@@ -111,50 +104,21 @@ impl WorkQueue {
             self.remove_worker(removable.ok_or(JoinError::RunFull)?);
         }
         self.latest_worker += 1;
-        let worker =
-            Worker { name, last_seen: now, n_episodes: 0, slot: None, silent: false, connection };
+        let worker = Worker {
+            name,
+            last_seen: now,
+            n_episodes: 0,
+            slot: None,
+            silent: false,
+            connection: None,
+            reported_slot: None,
+        };
         self.workers.insert(self.latest_worker, worker);
         self.newcomers.insert(self.latest_worker);
         if let Some(connection) = connection {
-            let connection = self.connections.entry(connection).or_default();
-            connection.workers.insert(self.latest_worker);
-            connection.n_unproven += 1;
+            self.attach(self.latest_worker, connection);
         }
         Ok(self.latest_worker)
-    }
-
-    /// Returns the worker that a full queue removes for a worker whose connection has `n_unproven` others that have
-    /// delivered nothing.
-    fn eviction_candidate(&self, n_unproven: usize, now: Duration) -> Option<u64> {
-        let does_not_ask = |id: &&u64| {
-            self.worker(**id)
-                .is_some_and(|worker| now.saturating_sub(worker.last_seen) >= ASK_WITHIN)
-        };
-        let longest_silent = || {
-            let longest = self.workers.iter().min_by_key(|(_, worker)| worker.last_seen);
-            longest.filter(|(_, worker)| is_silent(worker, now)).map(|(id, _)| *id)
-        };
-        let crowded = || {
-            let counted = self.connections.iter().map(|(number, it)| (it.n_unproven, *number));
-            counted.max().filter(|(n, _)| *n > n_unproven + 1).map(|(_, connection)| connection)
-        };
-        self.newcomers
-            .first()
-            .filter(does_not_ask)
-            .copied()
-            .or_else(longest_silent)
-            .or_else(|| self.oldest_idle(crowded()?))
-    }
-
-    fn n_unproven(&self, connection: u64) -> usize {
-        self.connections.get(&connection).map_or(0, |connection| connection.n_unproven)
-    }
-
-    /// Returns the oldest worker of a connection that has delivered nothing and plays nothing.
-    fn oldest_idle(&self, connection: u64) -> Option<u64> {
-        let is_idle = |worker: &Worker| worker.n_episodes == 0 && worker.slot.is_none();
-        let theirs = &self.connections.get(&connection)?.workers;
-        theirs.iter().find(|id| self.worker(**id).is_some_and(is_idle)).copied()
     }
 
     /// Removes a worker; its slot returns to the queue.
@@ -187,6 +151,13 @@ impl WorkQueue {
         if let Some(connection) = connection.and_then(|it| self.connections.get_mut(&it)) {
             connection.n_unproven -= 1;
         }
+    }
+
+    /// Returns true if a worker's report on environments that arrives with `slot` is new, and false if the call that
+    /// brought it was repeated or the worker is not known any more.
+    pub fn is_new_report(&mut self, worker_id: u64, slot: u64) -> bool {
+        let worker = self.workers.get_mut(&worker_id);
+        worker.is_some_and(|worker| worker.reported_slot.replace(slot) != Some(slot))
     }
 
     /// Limits the units of advice that episodes can claim, by episode number.
@@ -378,31 +349,6 @@ impl WorkQueue {
             self.workers.iter().filter(|(_, worker)| is_gone(worker)).map(|(id, _)| *id).collect();
         gone.into_iter().for_each(|id| self.remove_worker(id));
         fell_silent
-    }
-
-    /// Removes a closed connection, and its workers that never asked for work. Returns the workers whose slots have
-    /// returned to the queue.
-    pub fn remove_connection(&mut self, connection: u64) -> Vec<u64> {
-        let theirs = self.connections.remove(&connection).unwrap_or_default();
-        let mut requeued = Vec::new();
-        for worker_id in theirs.workers {
-            if let Some(worker) = self.workers.get_mut(&worker_id) {
-                worker.connection = None;
-            }
-            if self.newcomers.contains(&worker_id) {
-                self.remove_worker(worker_id);
-            } else if self.release_slot(worker_id) {
-                requeued.push(worker_id);
-            }
-        }
-        requeued
-    }
-
-    /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker
-    /// stays: it may call again, and the episodes that it delivers count.
-    pub fn release_slot(&mut self, worker_id: u64) -> bool {
-        self.worker(worker_id).is_some_and(|worker| worker.slot.is_some())
-            && self.requeue_slots_of(worker_id) > 0
     }
 
     fn requeue_slots_of(&mut self, worker_id: u64) -> usize {

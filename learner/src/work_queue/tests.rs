@@ -2,6 +2,7 @@
 
 mod lock_steps;
 mod model;
+mod reconnected;
 mod removed;
 
 use tandem_core::work::{EpisodeExploration, EpisodeOrder};

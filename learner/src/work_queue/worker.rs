@@ -15,8 +15,10 @@ pub struct Worker {
     pub slot: Option<u64>,
     /// True if it counts as dead.
     pub silent: bool,
-    /// The connection over which it joined, while that is open.
+    /// The connection over which it joined, or asked for work since, while that is open.
     pub connection: Option<u64>,
+    /// The slot with which its latest report on environments arrived.
+    pub reported_slot: Option<u64>,
 }
 
 /// A worker that counts as dead.
