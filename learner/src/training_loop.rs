@@ -105,6 +105,8 @@ struct LearnerLoop<'a> {
     evaluations: Evaluations<'a>,
     persistence: Persistence<'a>,
     progress: ProgressPublisher<'a>,
+    /// Time of the latest check for silent workers.
+    reclaimed_at: Option<Duration>,
 }
 
 impl LearnerLoop<'_> {
@@ -120,6 +122,7 @@ impl LearnerLoop<'_> {
         if !self.open_round(self.trainer.counters().round, self.acting.version)? {
             return Ok(StopReason::Interrupted);
         }
+        self.publish_progress(Phase::Collecting);
         if self.trainer.counters().round == 0 && self.evaluations.is_due(0) {
             self.schedule_evaluation(&self.trainer.stats());
             self.order_evaluation();
@@ -250,31 +253,43 @@ impl LearnerLoop<'_> {
 
     /// Waits for all episodes of `kind` with parameter version `version`; returns `None` if the run is interrupted.
     fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Option<Vec<Episode>>, Error> {
-        let Context { config, shared, runtime, shutdown } = self.context;
-        let mut checked_at = None;
+        let Context { shared, runtime, shutdown, .. } = self.context;
+        let phase = match kind {
+            EpisodeKind::Training => Phase::Collecting,
+            EpisodeKind::Evaluation => Phase::Evaluating,
+        };
         loop {
             if !self.restore_lost_account()? {
                 return Ok(None);
             }
+            self.reclaim_slots();
             let mut state = shared.lock();
             if state.queue.is_complete(kind, version) {
                 return Ok(Some(state.queue.take(kind, version)));
             }
+            drop(state);
+            if self.progress.is_due() {
+                self.publish_progress(phase);
+            }
             if shutdown.is_cancelled() {
                 return Ok(None);
             }
-            let now = (config.clock)();
-            // The check visits all workers, so it does not run for every slot that arrives.
-            if checked_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
-                checked_at = Some(now);
-                report_silent(&state.queue.reclaim(now));
-            }
-            drop(state);
             let arrived = shared.arrived.clone();
             let next = async move { tokio::time::timeout(WAIT_TICK, arrived.notified()).await };
             if runtime.wait_on(next).is_none() {
                 return Ok(None);
             }
+        }
+    }
+
+    /// Requeues the slots of silent workers and reports these workers. The check visits all workers, so it does not run
+    /// for every slot that arrives.
+    fn reclaim_slots(&mut self) {
+        let now = (self.context.config.clock)();
+        if self.reclaimed_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
+            self.reclaimed_at = Some(now);
+            let fell_silent = self.context.shared.lock().queue.reclaim(now);
+            report_silent(&fell_silent);
         }
     }
 
@@ -370,7 +385,7 @@ impl LearnerLoop<'_> {
         Ok(true)
     }
 
-    fn publish_progress(&self, phase: Phase) {
+    fn publish_progress(&mut self, phase: Phase) {
         self.progress.publish(phase, &self.trainer, &self.trainer.stats());
     }
 
@@ -446,3 +461,6 @@ fn unless_stopped<T>(outcome: Result<T, TeacherError>) -> Result<Option<T>, Teac
         outcome => outcome.map(Some),
     }
 }
+
+#[cfg(test)]
+mod tests;

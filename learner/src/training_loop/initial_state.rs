@@ -190,6 +190,7 @@ impl<'a> LearnerLoop<'a> {
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),
+            reclaimed_at: None,
         };
         for pending in learner.evaluations.pending() {
             learner.order(learner.trainer.evaluation_orders(pending.counters.round));

@@ -112,6 +112,25 @@ async fn deliver_with_failures(
 }
 
 #[tokio::test]
+async fn a_run_without_workers_shows_that_it_waits_for_episodes() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
+    let mut client = served.client().await;
+    let collects = async {
+        loop {
+            let progress = client.status(pb::StatusRequest {}).await.expect("it lives");
+            if progress.into_inner().phase == "collecting" {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(DEADLINE, collects).await.expect("it collects in time");
+    served.shutdown.cancel();
+    served.end().await.expect("interrupted");
+}
+
+#[tokio::test]
 async fn failures_count_once_even_if_another_worker_has_delivered_the_slot() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
