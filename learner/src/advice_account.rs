@@ -194,7 +194,7 @@ impl AdviceAccount {
             "the teacher's account {name:?} was used before, {spent} units are spent: a run of the same name decides \
              on this run's advice, give this one another name"
         );
-        warnings.set_first(Source::Advice, &warning);
+        warnings.set_first(Source::Account, &warning);
     }
 
     /// Checks that the teacher advises on the task of one arm, and returns the digest of its policy.

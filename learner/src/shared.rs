@@ -161,7 +161,7 @@ impl Shared {
         let n_failures = self.progress.borrow().environment.n_failures;
         if check.failures > 0 && n_failures >= MIN_FAILURES_OF_WARNING {
             let warning = format!(
-                "the environments fail repeatedly, their episodes are played again; one failure, of the server {}",
+                "the environments fail repeatedly, their episodes are played again: one failure, of the server {}",
                 shown(&check.failure)
             );
             self.warnings.set_first(Source::Failures, &warning);

@@ -184,7 +184,7 @@ impl LearnerLoop<'_> {
                 "the episodes of round {round} claim {claimed} units of advice, the teacher's account {name:?} was \
                  charged {charged}: the account counts"
             );
-            self.context.shared.warnings.set_first(Source::Advice, &warning);
+            self.context.shared.warnings.set_first(Source::Claims, &warning);
         }
         Ok(Some(spent + settlement.units))
     }

@@ -74,7 +74,7 @@ async fn failures_of_environments_are_counted_and_warned_of_once() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
     let mut toy = served.join("toy").await;
-    let first = "the environments fail repeatedly, their episodes are played again; one failure, of the server \
+    let first = "the environments fail repeatedly, their episodes are played again: one failure, of the server \
                  http://x:1 (fake): boom 1";
     for (failures, total, warning) in [(2, 2, ""), (1, 3, first), (5, 8, first)] {
         let (order, episodes) = toy.take().await.expect("a slot");
