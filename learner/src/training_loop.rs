@@ -19,6 +19,7 @@ use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, 
 use tokio_util::sync::CancellationToken;
 
 use crate::advice_account::{AdviceAccount, Mismatch, TeacherError};
+use crate::checkpoint::RenamedAccount;
 use crate::error::Error;
 use crate::progress::Phase;
 use crate::runtime::Runtime;
@@ -102,6 +103,8 @@ struct LearnerLoop<'a> {
     account: Option<AdviceAccount>,
     /// The digest of the teacher's policy when the run began, if it is known.
     teacher_policy: Option<String>,
+    /// The account, unless it has the run's name.
+    renamed_account: Option<RenamedAccount>,
     evaluations: Evaluations<'a>,
     persistence: Persistence<'a>,
     progress: ProgressPublisher<'a>,
@@ -408,6 +411,7 @@ impl<'a> LearnerLoop<'a> {
             evaluations: &mut self.evaluations,
             wall_s: self.progress.wall_s(),
             teacher_policy: self.teacher_policy.as_deref(),
+            renamed_account: self.renamed_account.as_ref(),
         };
         (&mut self.persistence, state)
     }

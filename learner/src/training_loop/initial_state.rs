@@ -104,6 +104,7 @@ impl InitialState {
                 budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
+            renamed: self.resumption.account.clone(),
             first_policy: self.resumption.teacher_policy.clone(),
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),
@@ -166,8 +167,10 @@ impl<'a> LearnerLoop<'a> {
     ) -> Self {
         let Context { config, shared, .. } = context;
         let InitialState { trainer, resumption, lock, .. } = initial;
-        let Resumption { acting, history, pending, wall_s, teacher_policy } = resumption;
+        let Resumption { acting, history, pending, wall_s, teacher_policy, account: renamed } =
+            resumption;
         let policy = account.as_ref().and_then(AdviceAccount::policy).map(str::to_owned);
+        let renamed_account = account.as_ref().and_then(AdviceAccount::renamed).or(renamed);
         let terms = RunTerms {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
@@ -187,6 +190,7 @@ impl<'a> LearnerLoop<'a> {
             acting,
             account,
             teacher_policy: policy.or(teacher_policy),
+            renamed_account,
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),

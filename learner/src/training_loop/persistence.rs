@@ -9,7 +9,7 @@ use tandem_telemetry::events::CheckpointSaved;
 
 use super::evaluations::Evaluations;
 use super::run_lock::RunLock;
-use crate::checkpoint::{self, Resumption, Saved};
+use crate::checkpoint::{self, RenamedAccount, Resumption, Saved};
 use crate::error::Error;
 use crate::evaluation_store::{UnwrittenFile, innermost};
 use crate::shared::{LearnerConfig, Shared};
@@ -39,6 +39,7 @@ pub(super) struct LoopState<'a, 'c> {
     pub(super) evaluations: &'a mut Evaluations<'c>,
     pub(super) wall_s: f64,
     pub(super) teacher_policy: Option<&'a str>,
+    pub(super) renamed_account: Option<&'a RenamedAccount>,
 }
 
 impl LoopState<'_, '_> {
@@ -124,6 +125,7 @@ impl<'a> Persistence<'a> {
             pending: state.evaluations.pending().iter().cloned().collect(),
             wall_s: state.wall_s,
             teacher_policy: state.teacher_policy.map(str::to_owned),
+            account: state.renamed_account.cloned(),
         };
         let directory = self.config.out.join("checkpoint");
         let keep = self.config.run.checkpoint.keep;
