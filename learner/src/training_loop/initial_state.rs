@@ -11,10 +11,11 @@ use tandem_system::atomic_file;
 use tandem_telemetry::events::RunResumed;
 
 use super::evaluations::Evaluations;
+use super::halt::Halt;
 use super::persistence::Persistence;
 use super::progress_publisher::ProgressPublisher;
 use super::run_lock::RunLock;
-use super::{Context, LearnerLoop, is_beyond_end};
+use super::{Context, LearnerLoop, reached_limit};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
@@ -73,19 +74,15 @@ impl InitialState {
         Ok(Self { trainer, resumption, is_resumed, was_started, lock })
     }
 
-    /// Returns true if the run has reached one of its ends.
+    /// Returns true if the run has reached one of its limits.
     pub(super) fn is_complete(&self, config: &LearnerConfig) -> bool {
-        let stop = &config.run.stop;
-        self.resumption.history.first_reaching(stop.until_success).is_some()
-            || is_beyond_end(&config.run, self.trainer.counters().round)
-            || (stop.max_minutes > 0.0 && self.resumption.wall_s >= stop.max_minutes * 60.0)
+        let Resumption { history, wall_s, .. } = &self.resumption;
+        let round = self.trainer.counters().round;
+        reached_limit(&config.run, history, round, *wall_s).is_some()
     }
 
     /// Opens the run's account at the teacher if the run asks for advice.
-    pub(super) fn open_account(
-        &self,
-        context: Context<'_>,
-    ) -> Result<Option<AdviceAccount>, Error> {
+    pub(super) fn open_account(&self, context: Context<'_>) -> Result<Option<AdviceAccount>, Halt> {
         let config = context.config;
         let advice = &config.run.advice;
         if !advice.asks() {
