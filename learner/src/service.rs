@@ -107,9 +107,8 @@ fn serve_boxed(
 ) -> Pin<Box<dyn Future<Output = Result<RunOutcome, Error>> + Send>> {
     Box::pin(async move {
         let timings = Timings::register(config.server_config.metrics());
-        let shared = Arc::new(Shared::new(config.clock.clone(), timings));
+        let shared = Arc::new(Shared::new(&config, timings));
         metrics::add(config.server_config.metrics(), &shared);
-        shared.lock().queue.start_workers_at(config.first_worker);
         let learner = LearnerServer::new(LearnerService {
             shared: shared.clone(),
             start: config.first_worker,
@@ -370,7 +369,7 @@ impl LearnerService {
             return Ok((Some(Work::Finished(encode_finished(&end))), WORK_POLL));
         }
         let order = state.queue.next(worker_id, now).map_err(|error| refusal(&error, None))?;
-        let retry_in = state.queue.next_cover_in(now).unwrap_or(WORK_POLL);
+        let retry_in = state.queue.next_backup_in(now).unwrap_or(WORK_POLL);
         drop(state);
         Ok((order.map(|order| Work::Slot(encode_slot(&order))), retry_in))
     }

@@ -177,7 +177,6 @@ impl<'a> LearnerLoop<'a> {
             world: config.run.world,
             symmetrized_evaluation: config.run.evaluation.symmetrized,
         };
-        shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);
         // The clock counts from the start of this process, and the run's wall time continues that of its earlier parts.
         let started_s = config.unix_start.as_secs_f64() - wall_s;

@@ -192,9 +192,10 @@ fn count_acted(acted: &mut Vec<ActedSteps>, episode: &Episode) {
 
 /// Returns the workers, without a silent one whose name an active one has: that is a restarted worker.
 fn workers(queue: &WorkQueue) -> Vec<WorkerProgress> {
-    let active = queue.workers().filter(|(_, worker)| !worker.silent);
+    let active = queue.workers().filter(|(_, worker)| !worker.reported_silent);
     let active: BTreeSet<&str> = active.map(|(_, worker)| worker.name.as_str()).collect();
-    let is_shown = |worker: &Worker| !worker.silent || !active.contains(worker.name.as_str());
+    let is_shown =
+        |worker: &Worker| !worker.reported_silent || !active.contains(worker.name.as_str());
     let shown = queue.workers().filter(|(_, worker)| is_shown(worker));
     let progress = |(worker_id, worker): (u64, &Worker)| WorkerProgress {
         worker_id,
@@ -207,7 +208,7 @@ fn workers(queue: &WorkQueue) -> Vec<WorkerProgress> {
 
 fn activity(worker: &Worker) -> Activity {
     match worker.slot {
-        _ if worker.silent => Activity::Silent,
+        _ if worker.reported_silent => Activity::Silent,
         Some(slot) => Activity::Slot(slot),
         None => Activity::Waiting,
     }

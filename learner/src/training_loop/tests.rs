@@ -55,7 +55,7 @@ async fn with_loop(
     let config = config(out, &time);
     let checked = on_a_thread("learn", Pacing::Concurrent, move |runtime| {
         let timings = Timings::register(config.server_config.metrics());
-        let shared = Shared::new(config.clock.clone(), timings);
+        let shared = Shared::new(&config, timings);
         let shutdown = CancellationToken::new();
         let context =
             Context { config: &config, shared: &shared, runtime: &runtime, shutdown: &shutdown };
@@ -83,7 +83,7 @@ async fn silent_workers_are_noticed_in_a_run_that_never_waits() {
         // Nothing is ordered, so nothing is awaited.
         let episodes = learner.wait_for(EpisodeKind::Training, 0).expect("nothing is missing");
         assert_eq!(episodes, []);
-        assert!(shared.lock().queue.worker(worker).expect("known").silent);
+        assert!(shared.lock().queue.worker(worker).expect("known").reported_silent);
     })
     .await;
 }

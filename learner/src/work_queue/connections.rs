@@ -1,9 +1,9 @@
-//! The connections over which workers call: their limits, and what their ends mean.
+//! The connections over which workers call: their limits, and the consequences of their ends.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use super::{ASK_WITHIN, MAX_UNPROVEN_PER_CONNECTION, WorkQueue, Worker, is_silent};
+use super::{ASK_WITHIN, MAX_UNPROVEN_PER_CONNECTION, WorkQueue, Worker};
 
 /// An open connection.
 #[derive(Debug, Default)]
@@ -40,7 +40,7 @@ impl WorkQueue {
         };
         let longest_silent = || {
             let longest = self.workers.iter().min_by_key(|(_, worker)| worker.last_seen);
-            longest.filter(|(_, worker)| is_silent(worker, now)).map(|(id, _)| *id)
+            longest.filter(|(_, worker)| worker.is_silent(now)).map(|(id, _)| *id)
         };
         let crowded = || {
             let counted = self.connections.iter().map(|(number, it)| (it.n_unproven, *number));
@@ -83,9 +83,9 @@ impl WorkQueue {
         requeued
     }
 
-    /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker
-    /// stays: it may call again, and the episodes that it delivers count.
-    pub fn release_slot(&mut self, worker_id: u64) -> bool {
+    /// Requeues the slot of a disconnected worker; returns true if it had one. The worker stays: it may call again, and
+    /// the episodes that it delivers count.
+    pub(super) fn release_slot(&mut self, worker_id: u64) -> bool {
         self.worker(worker_id).is_some_and(|worker| worker.slot.is_some())
             && self.requeue_slots_of(worker_id) > 0
     }
