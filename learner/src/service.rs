@@ -6,7 +6,6 @@ mod refusals;
 pub use messages::encode_evaluation;
 
 use std::panic::AssertUnwindSafe;
-use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,7 +28,7 @@ use tonic::{Request, Response, Status};
 use crate::error::Error;
 use crate::metrics;
 use crate::progress::RunEnd;
-use crate::runtime::{Runtime, on_a_thread};
+use crate::runtime::on_a_thread;
 use crate::shared::{LearnerConfig, Shared, State};
 use crate::timings::Timings;
 use crate::training_loop::{self, Context, RunOutcome};
@@ -126,14 +125,14 @@ fn serve_boxed(
             let (pacing, shutdown) = (config.pacing, shutdown.clone());
             on_a_thread("learn", pacing, move |runtime| {
                 let _stop = stop;
-                let outcome = learn(&config, &shared, &runtime, &shutdown);
-                runtime.wait_on(linger(options.linger));
-                if is_complete(&outcome) {
-                    runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
-                    runtime.wait_on(stay(options.linger, shutdown));
-                }
-                // The streams of watchers close at the first message after the one that reports the end.
-                shared.progress.send_modify(|_| ());
+                let context = Context {
+                    config: &config,
+                    shared: &shared,
+                    runtime: &runtime,
+                    shutdown: &shutdown,
+                };
+                let outcome = learn(context);
+                linger(context, &shared, &outcome, options.linger);
                 outcome
             })
         };
@@ -148,11 +147,7 @@ fn serve_boxed(
             served
         };
         let (joined, served) = tokio::join!(learning, serving);
-        let outcome = joined.map_err(|source| Error::RunDirectory {
-            action: "start a thread for",
-            path: PathBuf::from("learning"),
-            source: source.into(),
-        })?;
+        let outcome = joined.map_err(Error::Thread)?;
         served?;
         outcome.unwrap_or(Err(Error::Panicked))
     })
@@ -162,9 +157,26 @@ fn is_complete(outcome: &Result<RunOutcome, Error>) -> bool {
     outcome.as_ref().is_ok_and(|outcome| !outcome.interrupted)
 }
 
+/// Blocks until clients know of the end of the run; after a complete run also until all workers do, and for as long as
+/// the policy asks for.
+fn linger(
+    Context { runtime, shutdown, .. }: Context<'_>,
+    shared: &Arc<Shared>,
+    outcome: &Result<RunOutcome, Error>,
+    policy: LingerPolicy,
+) {
+    runtime.wait_on(wait_for_pollers(policy));
+    if is_complete(outcome) {
+        runtime.wait_on(wait_for_workers(shared.clone(), shutdown.clone()));
+        runtime.wait_on(wait_for_shutdown(policy, shutdown.clone()));
+    }
+    // The streams of watchers close at the first message after the one that reports the end.
+    shared.progress.send_modify(|_| ());
+}
+
 /// Waits until every worker that was playing at the end of the run has asked for work and received the end, or counts
 /// as dead. A worker that does not know of the end would wait for the learner forever.
-async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
+async fn wait_for_workers(shared: Arc<Shared>, shutdown: CancellationToken) {
     while shared.lock().awaits_workers((shared.clock)()) {
         tokio::select! {
             () = tokio::time::sleep(LINGER_TICK) => (),
@@ -182,7 +194,7 @@ async fn serve_metrics(listener: Option<TcpListener>, page: TextEndpoint) {
 }
 
 /// Waits until clients that poll have learned of the end.
-async fn linger(policy: LingerPolicy) {
+async fn wait_for_pollers(policy: LingerPolicy) {
     match policy {
         LingerPolicy::For(duration) => tokio::time::sleep(duration).await,
         LingerPolicy::UntilShutdown => tokio::time::sleep(LINGER).await,
@@ -190,20 +202,15 @@ async fn linger(policy: LingerPolicy) {
 }
 
 /// Waits for `shutdown` if the policy asks for it.
-async fn stay(policy: LingerPolicy, shutdown: CancellationToken) {
+async fn wait_for_shutdown(policy: LingerPolicy, shutdown: CancellationToken) {
     if policy == LingerPolicy::UntilShutdown {
         shutdown.cancelled().await;
     }
 }
 
 /// Runs the run and reports its end to workers and watchers, after a panic too.
-fn learn(
-    config: &LearnerConfig,
-    shared: &Shared,
-    runtime: &Runtime,
-    shutdown: &CancellationToken,
-) -> Result<RunOutcome, Error> {
-    let context = Context { config, shared, runtime, shutdown };
+fn learn(context: Context<'_>) -> Result<RunOutcome, Error> {
+    let shared = context.shared;
     let run = AssertUnwindSafe(|| training_loop::run(context));
     let outcome = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
     let end = RunEnd {

@@ -176,8 +176,7 @@ impl<'a> Persistence<'a> {
         if trouble.is_empty() {
             return Ok(());
         }
-        let path = self.config.out.clone();
-        Err(Error::RunDirectory { action: "write everything to", path, source: trouble.into() })
+        Err(Error::Unwritten { out: self.config.out.clone(), trouble })
     }
 
     /// Returns the files that cannot be written and the causes; empty if there are none.
