@@ -65,7 +65,7 @@ pub(crate) struct EvaluationStore {
     out: PathBuf,
     /// The start of the run, seconds since 1970.
     started_s: f64,
-    /// Whether files contain the symmetrised policies.
+    /// True if files contain the symmetrised policies.
     symmetrized: bool,
     history: EvaluationHistory,
     metrics_due: bool,

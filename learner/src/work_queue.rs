@@ -56,7 +56,7 @@ pub struct WorkQueue {
     newcomers: BTreeSet<u64>,
     /// Units of advice that open episodes can claim; an episode without an entry can claim a unit per step.
     claim_limits: BTreeMap<u64, u32>,
-    /// The object of a unit of advice.
+    /// The steps that a unit of advice pays for.
     advice_unit: AdviceUnit,
 }
 

@@ -34,7 +34,7 @@ pub(super) struct InitialState {
     pub(super) trainer: Trainer,
     resumption: Resumption,
     is_resumed: bool,
-    /// Whether the run was started before.
+    /// True if the run was started before.
     was_started: bool,
     lock: RunLock,
 }
