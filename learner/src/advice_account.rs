@@ -278,8 +278,8 @@ impl AdviceAccount {
         if self.audit.is_whole() { leases.iter().map(allowance).collect() } else { Vec::new() }
     }
 
-    /// Releases the unspent units of finished episodes and returns what the episodes cost. `spent` counts the units of the
-    /// episodes learned so far, without these. No other lease may be open.
+    /// Releases the unspent units of finished episodes and returns what the episodes cost. `spent` counts the units of
+    /// the episodes learned so far, without these. No other lease may be open.
     pub(crate) fn settle(
         &mut self,
         episodes: &[Episode],

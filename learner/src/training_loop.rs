@@ -169,8 +169,8 @@ impl LearnerLoop<'_> {
         self.complete_overdue_evaluations()
     }
 
-    /// Settles the leases of a round's episodes and returns the units of advice spent so far. The teacher's account, not
-    /// the worker, determines what an episode has cost.
+    /// Settles the leases of a round's episodes and returns the units of advice spent so far. The teacher's account,
+    /// not the worker, determines what an episode has cost.
     fn settle(&mut self, episodes: &[Episode]) -> Result<u64, Halt> {
         let spent = self.trainer.counters().advice_spent;
         let Some(account) = &mut self.account else { return Ok(spent) };

@@ -69,8 +69,8 @@ impl AccountWatcher {
 }
 
 /// Warns if the teacher was restarted with another policy than the `first` one, perhaps for another task: requests for
-/// advice do not name the policy. The warning remains, with another text, once the first policy is back, because the run
-/// has learned from the other one's advice.
+/// advice do not name the policy. The warning remains, with another text, once the first policy is back, because the
+/// run has learned from the other one's advice.
 pub(super) fn warn_of_other_policy(warnings: &Warnings, now: &str, first: &str) {
     let is_first = now == first;
     if is_first && warnings.of(Source::Policy).is_none() {

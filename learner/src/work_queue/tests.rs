@@ -391,25 +391,6 @@ fn a_full_queue_removes_a_worker_of_the_largest_connection() {
     assert_eq!(refused, Err(JoinError::RunFull), "no connection has more than this one would have");
 }
 
-#[test]
-fn joins_end_with_their_connection() {
-    let mut queue = WorkQueue::default();
-    queue.push(order(0, EpisodeKind::Training));
-    let joined: Vec<u64> =
-        (0..3).map(|_| queue.join("w".to_owned(), Some(7), at(0)).expect("room")).collect();
-    let other = queue.join("w".to_owned(), Some(8), at(0)).expect("room");
-    assert_eq!(next_slot(&mut queue, joined[0], at(0)), Some(0));
-    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
-    assert_eq!(queue.remove_connection(7), [joined[0]], "it had a slot");
-    assert_eq!(queue.next(joined[2], at(0)), Err(QueueError::UnknownWorker(joined[2])));
-    assert_eq!(next_slot(&mut queue, other, at(0)), Some(0));
-    // Those that were only cut off call again over another connection.
-    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
-    assert_eq!(queue.submit(joined[0], 0, played(0), at(1)), Ok(true));
-    assert_eq!(queue.remove_connection(7), [0; 0], "that is known");
-    assert_eq!(queue.remove_connection(99), [0; 0], "a strange one");
-}
-
 /// An advised training slot of one episode, and an episode that claims `charged` units with these arms advised.
 fn advised(charged: u32, advised_arms: &[u8]) -> (SlotOrder, Vec<Episode>) {
     let mut ordered = order(0, EpisodeKind::Training);

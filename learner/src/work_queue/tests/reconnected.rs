@@ -1,6 +1,25 @@
-//! Workers that call again over another connection, and reports that arrive with a slot.
+//! Workers whose connections end, and that may call again over another one; reports that arrive with a slot.
 
 use super::*;
+
+#[test]
+fn joins_end_with_their_connection() {
+    let mut queue = WorkQueue::default();
+    queue.push(order(0, EpisodeKind::Training));
+    let joined: Vec<u64> =
+        (0..3).map(|_| queue.join("w".to_owned(), Some(7), at(0)).expect("room")).collect();
+    let other = queue.join("w".to_owned(), Some(8), at(0)).expect("room");
+    assert_eq!(next_slot(&mut queue, joined[0], at(0)), Some(0));
+    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
+    assert_eq!(queue.remove_connection(7), [joined[0]], "it had a slot");
+    assert_eq!(queue.next(joined[2], at(0)), Err(QueueError::UnknownWorker(joined[2])));
+    assert_eq!(next_slot(&mut queue, other, at(0)), Some(0));
+    // Those that were only cut off call again over another connection.
+    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
+    assert_eq!(queue.submit(joined[0], 0, played(0), at(1)), Ok(true));
+    assert_eq!(queue.remove_connection(7), [0; 0], "that is known");
+    assert_eq!(queue.remove_connection(99), [0; 0], "a strange one");
+}
 
 #[test]
 fn a_worker_that_calls_again_belongs_to_its_new_connection() {
