@@ -21,6 +21,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::Status;
 use tracing::warn;
 
+use crate::checkpoint::RenamedAccount;
 use crate::runtime::Runtime;
 use crate::shared::Clock;
 use crate::warnings::{Source, Warnings};
@@ -87,6 +88,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) terms: pb::OpenAccountRequest,
     /// The start of the run.
     pub(crate) start: RunStart,
+    /// The account of the run's checkpoint, if it has another name than the run.
+    pub(crate) renamed: Option<RenamedAccount>,
     /// The digest of the teacher's policy when the run began, if it is known.
     pub(crate) first_policy: Option<String>,
     /// Receives the state of the teacher.
@@ -101,7 +104,9 @@ pub(crate) struct AdviceAccount {
     client: TeacherClient<AuthChannel>,
     runtime: Runtime,
     shutdown: CancellationToken,
-    /// Name, budget and strategy, from the run file.
+    /// The run's name.
+    run: String,
+    /// The account's name, and the run's budget and strategy.
     terms: pb::OpenAccountRequest,
     /// Advised episodes whose leases are open.
     open_episodes: Vec<u64>,
@@ -128,21 +133,25 @@ impl AdviceAccount {
         runtime: &Runtime,
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
-        let AccountOptions { client_config, address, one_arm, terms, .. } = options;
-        let AccountOptions { start, first_policy, view, clock, .. } = options;
+        let AccountOptions { client_config, address, one_arm, mut terms, .. } = options;
+        let AccountOptions { start, renamed, first_policy, view, clock, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
         let (lost, stop_watching) = (Arc::new(AtomicBool::new(false)), CancellationToken::new());
-        let budget = terms.budget;
+        let (run, mut full_budget) = (terms.name.clone(), terms.budget);
+        if let Some(RenamedAccount { name, budget }) = renamed {
+            (terms.name, full_budget) = (name, budget);
+        }
         let mut account = Self {
             client: client.clone(),
             runtime: runtime.clone(),
             shutdown: shutdown.clone(),
+            run,
             terms,
             open_episodes: Vec::new(),
             units_per_episode: 0,
-            full_budget: budget,
+            full_budget,
             audit: Audit::new(Statement { spent: 0, leased: 0 }, 0, true),
             policy: String::new(),
             lost: lost.clone(),
@@ -194,7 +203,7 @@ impl AdviceAccount {
             "the teacher's account {name:?} was used before, {spent} units are spent: a run of the same name decides \
              on this run's advice, give this one another name"
         );
-        warnings.set_first(Source::Advice, &warning);
+        warnings.set_first(Source::Account, &warning);
     }
 
     /// Checks that the teacher advises on the task of one arm, and returns the digest of its policy.
@@ -221,6 +230,12 @@ impl AdviceAccount {
     /// Returns the name under which workers ask for advice.
     pub(crate) fn name(&self) -> &str {
         &self.terms.name
+    }
+
+    /// Returns the account if it has another name than the run.
+    pub(crate) fn renamed(&self) -> Option<RenamedAccount> {
+        let (name, budget) = (&self.terms.name, self.full_budget);
+        (*name != self.run).then(|| RenamedAccount { name: name.clone(), budget })
     }
 
     /// Returns the digest of the teacher's policy when the run began, if it is known.
@@ -263,8 +278,8 @@ impl AdviceAccount {
         if self.audit.is_whole() { leases.iter().map(allowance).collect() } else { Vec::new() }
     }
 
-    /// Returns the unspent units of finished episodes to the budget, and the cost of the episodes to the caller.
-    /// `spent` counts the units of the episodes learned so far, without these. No other lease may be open.
+    /// Releases the unspent units of finished episodes and returns what the episodes cost. `spent` counts the units of
+    /// the episodes learned so far, without these. No other lease may be open.
     pub(crate) fn settle(
         &mut self,
         episodes: &[Episode],
@@ -323,12 +338,13 @@ impl AdviceAccount {
     }
 
     /// Continues with the account. If it has more units left than the run may spend, because the ledger was restored to
-    /// an earlier state, opens another one under a new name; no worker uses the old name yet.
+    /// an earlier state, opens another one under a new name; no worker uses the old name yet. Checkpoints keep the new
+    /// name.
     fn resume(&mut self, spent: u64) -> Result<(), TeacherError> {
         let left = self.terms.budget.saturating_sub(spent);
         match self.balance()? {
             Some(found) if units_left(&found) > left => {
-                let name = format!("{}.from-{spent}", self.terms.name);
+                let name = format!("{}.from-{spent}", self.run);
                 warn!(
                     account = self.terms.name,
                     name, left, "the ledger lost charges, opening another account"

@@ -34,6 +34,17 @@ pub struct Resumption {
     /// The digest of the teacher's policy when the run began. `None` for a run without a teacher, and for one of an
     /// earlier version.
     pub teacher_policy: Option<String>,
+    /// The run's account at the teacher, unless it has the run's name.
+    pub account: Option<RenamedAccount>,
+}
+
+/// An account that a run opened under another name than its own, because the ledger had lost charges to the former one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RenamedAccount {
+    /// Its name.
+    pub name: String,
+    /// The budget with which it was opened first, units of advice.
+    pub budget: u64,
 }
 
 impl Resumption {
@@ -46,6 +57,7 @@ impl Resumption {
             pending: Vec::new(),
             wall_s: 0.0,
             teacher_policy: None,
+            account: None,
         }
     }
 }

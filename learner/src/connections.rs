@@ -18,12 +18,12 @@ pub(crate) struct Connections {
 
 impl Connections {
     /// Returns the number of a connection, and true if the connection is new.
-    pub(crate) fn register(&mut self, hangup: &ConnectionClosed) -> (u64, bool) {
-        if let Some((number, _)) = self.open.iter().rfind(|(_, known)| known.is_same(hangup)) {
+    pub(crate) fn register(&mut self, closed: &ConnectionClosed) -> (u64, bool) {
+        if let Some((number, _)) = self.open.iter().rfind(|(_, known)| known.is_same(closed)) {
             return (*number, false);
         }
         self.n_ever += 1;
-        self.open.insert(self.n_ever, hangup.clone());
+        self.open.insert(self.n_ever, closed.clone());
         (self.n_ever, true)
     }
 

@@ -1,5 +1,6 @@
 //! Errors of a learner.
 
+use std::io;
 use std::path::PathBuf;
 
 use tandem_core::EpisodeKind;
@@ -28,6 +29,14 @@ pub enum Error {
         path: PathBuf,
         /// The cause.
         source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// Results of the run could not be written before its end.
+    #[error("cannot write everything to {out:?}: {trouble}")]
+    Unwritten {
+        /// The run directory.
+        out: PathBuf,
+        /// The files and the causes.
+        trouble: String,
     },
     /// The teacher refused, or its address is malformed.
     #[error(transparent)]
@@ -74,6 +83,9 @@ pub enum Error {
     /// The server failed.
     #[error("cannot serve")]
     Serve(#[from] tonic::transport::Error),
+    /// The learning thread cannot be spawned.
+    #[error("cannot start the learning thread")]
+    Thread(#[source] io::Error),
     /// The learning thread panicked, which is a bug.
     #[error("the learning thread panicked")]
     Panicked,

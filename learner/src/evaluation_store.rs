@@ -3,10 +3,12 @@
 //! A checkpoint contains all of them; the files in the run directory are copies for users. A copy that cannot be
 //! written stays due until the write succeeds.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use tandem_policy::Policy;
 use tandem_rl::trainer::{Counters, RoundStats};
+use tandem_system::atomic_file;
 use tandem_telemetry::{MetricsLog, MetricsRow, tensorboard};
 
 /// The results of all complete evaluations.
@@ -63,7 +65,7 @@ pub(crate) struct EvaluationStore {
     out: PathBuf,
     /// The start of the run, seconds since 1970.
     started_s: f64,
-    /// Whether files contain the symmetrised policies.
+    /// True if files contain the symmetrised policies.
     symmetrized: bool,
     history: EvaluationHistory,
     metrics_due: bool,
@@ -154,9 +156,7 @@ fn still_due(
 }
 
 fn write_rows(path: &Path, rows: &[MetricsRow]) -> Result<(), AnyError> {
-    if let Some(directory) = path.parent() {
-        std::fs::create_dir_all(directory)?;
-    }
+    create_parent(path)?;
     let (mut log, n_written) = MetricsLog::restore(path, rows)?;
     for row in &rows[n_written..] {
         log.append(row)?;
@@ -165,17 +165,17 @@ fn write_rows(path: &Path, rows: &[MetricsRow]) -> Result<(), AnyError> {
 }
 
 fn write_events(path: &Path, rows: &[MetricsRow], started_s: f64) -> Result<(), AnyError> {
-    if let Some(directory) = path.parent() {
-        std::fs::create_dir_all(directory)?;
-    }
+    create_parent(path)?;
     Ok(tensorboard::write_events(path, rows, started_s)?)
 }
 
 fn write_policy(path: &Path, policy: &Policy) -> Result<(), AnyError> {
-    if let Some(directory) = path.parent() {
-        std::fs::create_dir_all(directory)?;
-    }
+    create_parent(path)?;
     Ok(policy.save(path)?)
+}
+
+fn create_parent(path: &Path) -> io::Result<()> {
+    path.parent().map_or(Ok(()), atomic_file::create_directory)
 }
 
 /// Returns the root cause of an error, such as the message of the file system.

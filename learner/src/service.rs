@@ -6,7 +6,6 @@ mod refusals;
 pub use messages::encode_evaluation;
 
 use std::panic::AssertUnwindSafe;
-use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,8 +28,8 @@ use tonic::{Request, Response, Status};
 use crate::error::Error;
 use crate::metrics;
 use crate::progress::RunEnd;
-use crate::runtime::{Runtime, on_a_thread};
-use crate::shared::{LearnerConfig, Shared};
+use crate::runtime::on_a_thread;
+use crate::shared::{LearnerConfig, Shared, State};
 use crate::timings::Timings;
 use crate::training_loop::{self, Context, RunOutcome};
 use crate::view;
@@ -107,9 +106,8 @@ fn serve_boxed(
 ) -> Pin<Box<dyn Future<Output = Result<RunOutcome, Error>> + Send>> {
     Box::pin(async move {
         let timings = Timings::register(config.server_config.metrics());
-        let shared = Arc::new(Shared::new(config.clock.clone(), timings));
+        let shared = Arc::new(Shared::new(&config, timings));
         metrics::add(config.server_config.metrics(), &shared);
-        shared.lock().queue.start_workers_at(config.first_worker);
         let learner = LearnerServer::new(LearnerService {
             shared: shared.clone(),
             start: config.first_worker,
@@ -122,18 +120,19 @@ fn serve_boxed(
         let serving_metrics = serve_metrics(options.metrics, page);
         let publishing = view::publish(options.views, shared.clone(), config.run.clone());
         let learning = {
-            let (pacing, stop) = (config.pacing, stop_serving.clone());
-            let shutdown = shutdown.clone();
+            // Also dropped if the thread cannot be started.
+            let stop = stop_serving.clone().drop_guard();
+            let (pacing, shutdown) = (config.pacing, shutdown.clone());
             on_a_thread("learn", pacing, move |runtime| {
-                let _stop = stop.drop_guard();
-                let outcome = learn(&config, &shared, &runtime, &shutdown);
-                runtime.wait_on(linger(options.linger));
-                if is_complete(&outcome) {
-                    runtime.wait_on(until_workers_know(shared.clone(), shutdown.clone()));
-                    runtime.wait_on(stay(options.linger, shutdown));
-                }
-                // The streams of watchers close at the first message after the one that reports the end.
-                shared.progress.send_modify(|_| ());
+                let _stop = stop;
+                let context = Context {
+                    config: &config,
+                    shared: &shared,
+                    runtime: &runtime,
+                    shutdown: &shutdown,
+                };
+                let outcome = learn(context);
+                linger(context, &shared, &outcome, options.linger);
                 outcome
             })
         };
@@ -148,11 +147,7 @@ fn serve_boxed(
             served
         };
         let (joined, served) = tokio::join!(learning, serving);
-        let outcome = joined.map_err(|source| Error::RunDirectory {
-            action: "start a thread for",
-            path: PathBuf::from("learning"),
-            source: source.into(),
-        })?;
+        let outcome = joined.map_err(Error::Thread)?;
         served?;
         outcome.unwrap_or(Err(Error::Panicked))
     })
@@ -162,9 +157,26 @@ fn is_complete(outcome: &Result<RunOutcome, Error>) -> bool {
     outcome.as_ref().is_ok_and(|outcome| !outcome.interrupted)
 }
 
+/// Blocks until clients know of the end of the run; after a complete run also until all workers do, and for as long as
+/// the policy asks for.
+fn linger(
+    Context { runtime, shutdown, .. }: Context<'_>,
+    shared: &Arc<Shared>,
+    outcome: &Result<RunOutcome, Error>,
+    policy: LingerPolicy,
+) {
+    runtime.wait_on(wait_for_pollers(policy));
+    if is_complete(outcome) {
+        runtime.wait_on(wait_for_workers(shared.clone(), shutdown.clone()));
+        runtime.wait_on(wait_for_shutdown(policy, shutdown.clone()));
+    }
+    // The streams of watchers close at the first message after the one that reports the end.
+    shared.progress.send_modify(|_| ());
+}
+
 /// Waits until every worker that was playing at the end of the run has asked for work and received the end, or counts
 /// as dead. A worker that does not know of the end would wait for the learner forever.
-async fn until_workers_know(shared: Arc<Shared>, shutdown: CancellationToken) {
+async fn wait_for_workers(shared: Arc<Shared>, shutdown: CancellationToken) {
     while shared.lock().awaits_workers((shared.clock)()) {
         tokio::select! {
             () = tokio::time::sleep(LINGER_TICK) => (),
@@ -182,7 +194,7 @@ async fn serve_metrics(listener: Option<TcpListener>, page: TextEndpoint) {
 }
 
 /// Waits until clients that poll have learned of the end.
-async fn linger(policy: LingerPolicy) {
+async fn wait_for_pollers(policy: LingerPolicy) {
     match policy {
         LingerPolicy::For(duration) => tokio::time::sleep(duration).await,
         LingerPolicy::UntilShutdown => tokio::time::sleep(LINGER).await,
@@ -190,20 +202,15 @@ async fn linger(policy: LingerPolicy) {
 }
 
 /// Waits for `shutdown` if the policy asks for it.
-async fn stay(policy: LingerPolicy, shutdown: CancellationToken) {
+async fn wait_for_shutdown(policy: LingerPolicy, shutdown: CancellationToken) {
     if policy == LingerPolicy::UntilShutdown {
         shutdown.cancelled().await;
     }
 }
 
 /// Runs the run and reports its end to workers and watchers, after a panic too.
-fn learn(
-    config: &LearnerConfig,
-    shared: &Shared,
-    runtime: &Runtime,
-    shutdown: &CancellationToken,
-) -> Result<RunOutcome, Error> {
-    let context = Context { config, shared, runtime, shutdown };
+fn learn(context: Context<'_>) -> Result<RunOutcome, Error> {
+    let shared = context.shared;
     let run = AssertUnwindSafe(|| training_loop::run(context));
     let outcome = std::panic::catch_unwind(run).unwrap_or(Err(Error::Panicked));
     let end = RunEnd {
@@ -249,7 +256,7 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::JoinRequest>,
     ) -> Result<Response<pb::JoinResponse>, Status> {
-        let hangup = ConnectionClosed::from_extensions(request.extensions());
+        let closed = ConnectionClosed::from_extensions(request.extensions());
         let pb::JoinRequest { worker: name, version } = request.into_inner();
         check_name(&name)?;
         check_version(&name, &version, "learner")?;
@@ -257,13 +264,10 @@ impl Learner for LearnerService {
         let mut state = self.shared.lock();
         let terms =
             state.terms.clone().ok_or_else(|| Status::unavailable("the run is starting"))?;
-        let connection = hangup.as_ref().map(|hangup| state.connections.register(hangup));
-        if let (Some(hangup), Some((number, true))) = (hangup, connection) {
-            tokio::spawn(requeue_when_closed(self.shared.clone(), number, hangup));
-        }
+        let connection = closed.map(|closed| self.register(&mut state, closed));
         let worker_id = state
             .queue
-            .join(name.clone(), connection.map(|(number, _)| number), now)
+            .join(name.clone(), connection, now)
             .map_err(|error| Status::resource_exhausted(error.to_string()))?;
         let decision = state.join_lines.count(now);
         drop(state);
@@ -281,7 +285,11 @@ impl Learner for LearnerService {
         &self,
         request: Request<pb::NextWorkRequest>,
     ) -> Result<Response<pb::NextWorkResponse>, Status> {
+        let closed = ConnectionClosed::from_extensions(request.extensions());
         let worker_id = request.into_inner().worker_id;
+        if let Some(closed) = closed {
+            self.attach(worker_id, closed);
+        }
         let search = async {
             loop {
                 let notified = self.shared.work.notified();
@@ -341,6 +349,24 @@ impl Learner for LearnerService {
 use pb::next_work_response::Work;
 
 impl LearnerService {
+    /// Returns the number of a connection. The slots of its workers return to the queue when it closes.
+    fn register(&self, state: &mut State, closed: ConnectionClosed) -> u64 {
+        let (number, is_new) = state.connections.register(&closed);
+        if is_new {
+            tokio::spawn(requeue_when_closed(self.shared.clone(), number, closed));
+        }
+        number
+    }
+
+    /// Attaches a worker that calls again after its connection has ended to its new connection.
+    fn attach(&self, worker_id: u64, closed: ConnectionClosed) {
+        let mut state = self.shared.lock();
+        if state.queue.worker(worker_id).is_some_and(|worker| worker.connection.is_none()) {
+            let connection = self.register(&mut state, closed);
+            state.queue.attach(worker_id, connection);
+        }
+    }
+
     /// Returns the work for a worker, and the time after which to retry if there is none.
     fn work_for(&self, worker_id: u64) -> Result<(Option<Work>, Duration), Status> {
         let now = (self.shared.clock)();
@@ -350,14 +376,33 @@ impl LearnerService {
             return Ok((Some(Work::Finished(encode_finished(&end))), WORK_POLL));
         }
         let order = state.queue.next(worker_id, now).map_err(|error| refusal(&error, None))?;
-        let retry_in = state.queue.next_cover_in(now).unwrap_or(WORK_POLL);
+        let retry_in = state.queue.next_backup_in(now).unwrap_or(WORK_POLL);
         drop(state);
         Ok((order.map(|order| Work::Slot(encode_slot(&order))), retry_in))
     }
 
-    /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored.
+    /// Accepts a slot's episodes if all of them match the order. Episodes that were submitted before are ignored, the
+    /// report on environments that comes with them is not: the worker sends it once.
     fn submit(&self, request: pb::SubmitEpisodesRequest) -> Result<(), Status> {
         let pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check } = request;
+        let is_new = self.accept(worker_id, slot, episodes)?;
+        let is_new_report = self.shared.lock().queue.is_new_report(worker_id, slot);
+        if (is_new || is_new_report)
+            && let Some(check) = environment_check
+        {
+            self.shared.record_environment_check(&check);
+        }
+        self.shared.arrived.notify_one();
+        Ok(())
+    }
+
+    /// Accepts a slot's episodes; returns false if they were submitted before.
+    fn accept(
+        &self,
+        worker_id: u64,
+        slot: u64,
+        episodes: Vec<pb::Episode>,
+    ) -> Result<bool, Status> {
         let now = (self.shared.clock)();
         let mut state = self.shared.lock();
         let terms =
@@ -366,7 +411,7 @@ impl LearnerService {
         let worker = state.queue.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
         let refused = |error| refusal(&error, worker.as_ref());
         let Some(order) = state.queue.order_of(worker_id, slot, now).map_err(refused)? else {
-            return Ok(());
+            return Ok(false);
         };
         check_count(order, episodes.len()).map_err(refused)?;
         // Decoding takes a while, so the lock is released for other calls.
@@ -377,13 +422,6 @@ impl LearnerService {
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;
-        let is_new = self.shared.lock().queue.submit(worker_id, slot, episodes, now);
-        if is_new.map_err(refused)?
-            && let Some(check) = environment_check
-        {
-            self.shared.record_environment_check(&check);
-        }
-        self.shared.arrived.notify_one();
-        Ok(())
+        self.shared.lock().queue.submit(worker_id, slot, episodes, now).map_err(refused)
     }
 }

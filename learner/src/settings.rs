@@ -3,6 +3,7 @@
 use std::fmt;
 
 use serde_json::Value;
+use tandem_core::task::TaskDescription;
 use tandem_core::text::shortened;
 use tandem_rl::config::{RunConfig, former_keys};
 
@@ -15,6 +16,9 @@ const FREE: [&str; 5] = [
     "evaluation.recorded_episodes",
     "evaluation.test_episodes",
 ];
+
+/// Key of the task's description, whose fields are left out where they have their default.
+const DESCRIPTION: &str = "description";
 
 /// Longest value in a message; the parts of a task's description may be long.
 const MAX_SHOWN_CHARS: usize = 80;
@@ -51,6 +55,7 @@ pub fn to_json(config: &RunConfig) -> String {
 /// Returns the first setting that affects learning and has another value in `config` than in `began_with`, a text
 /// written by [`to_json`]. A setting that only one of the two has is skipped: programs of two versions may know
 /// different settings. A setting that was added later has the value in effect before. `began_with` may use former keys.
+/// The task's descriptions are compared as a whole; one that cannot be read differs.
 ///
 /// # Errors
 /// When `began_with` is not such a text.
@@ -58,9 +63,11 @@ pub fn first_change(
     config: &RunConfig,
     began_with: &str,
 ) -> Result<Option<Changed>, serde_json::Error> {
-    let there: Value = serde_json::from_str(began_with)?;
+    let mut there: Value = serde_json::from_str(began_with)?;
     // Both pass through text: a value that was read has no more digits than it was written with.
-    let here: Value = serde_json::from_str(&to_json(config))?;
+    let mut here: Value = serde_json::from_str(&to_json(config))?;
+    let described_here = take_description(&mut here);
+    let described_there = take_description(&mut there);
     let settings = below(&here, String::new()).into_iter();
     let mut fixed = settings.filter(|(key, _)| !FREE.iter().any(|free| key.starts_with(free)));
     let changed = fixed.find_map(|(key, here)| {
@@ -71,7 +78,37 @@ pub fn first_change(
         let shown = |value: &str| shortened(value, MAX_SHOWN_CHARS);
         Some(Changed { key, here: shown(&here.to_string()), there: shown(&there) })
     });
-    Ok(changed.or_else(|| removed_setting(&there)))
+    Ok(changed
+        .or_else(|| removed_setting(&there))
+        .or_else(|| changed_description(&described_here, &described_there)))
+}
+
+/// A task's description, or the reason for which it cannot be read; `None` if the task is built-in.
+type Description = Option<Result<TaskDescription, serde_json::Error>>;
+
+/// Removes the task's description from `settings` and returns it.
+fn take_description(settings: &mut Value) -> Description {
+    settings.as_object_mut()?.remove(DESCRIPTION).map(serde_json::from_value)
+}
+
+/// Returns the first field in which two descriptions differ.
+fn changed_description(here: &Description, there: &Description) -> Option<Changed> {
+    let (field, here, there) = match (here, there) {
+        (None, None) => return None,
+        (Some(Ok(here)), Some(Ok(there))) => {
+            let difference = here.difference(there)?;
+            (format!(".{}", difference.field), difference.first, difference.second)
+        }
+        (here, there) => {
+            let shown = |description: &Description| match description {
+                None => "none".to_owned(),
+                Some(Ok(description)) => format!("that of {:?}", description.name),
+                Some(Err(error)) => format!("unreadable ({error})"),
+            };
+            (String::new(), shown(here), shown(there))
+        }
+    };
+    Some(Changed { key: format!("{DESCRIPTION}{field}"), here, there })
 }
 
 /// Returns a setting that no longer exists and whose value was not 0.
@@ -99,7 +136,7 @@ fn below(value: &Value, name: String) -> Vec<(String, Value)> {
 
 #[cfg(test)]
 mod tests {
-    use tandem_core::{JudgedAction, Task};
+    use tandem_core::{JudgedAction, Layout, Task};
 
     use super::*;
     use tandem_rl::config::Recipe;
@@ -138,6 +175,44 @@ mod tests {
         changed.evaluation.recorded_episodes = 0;
         changed.evaluation.test_episodes = 1;
         assert_eq!(first_change(&changed, &to_json(&config())).expect("JSON"), None);
+    }
+
+    #[test]
+    fn a_changed_description_is_named_even_if_the_field_had_its_default() {
+        type Change = fn(&mut TaskDescription);
+        let described = |change: Change| {
+            let mut description = Layout::new(Task::Push, 2).description();
+            description.contact_distances = Vec::new();
+            change(&mut description);
+            RunConfig { description: Some(description), ..config() }
+        };
+        let check = |here: &RunConfig, there: &RunConfig, expected: &str| {
+            let found = first_change(here, &to_json(there)).expect("JSON").expect("it differs");
+            assert_eq!(found.to_string(), expected);
+        };
+        let plain = described(|_| ());
+        assert_eq!(first_change(&plain, &to_json(&plain)).expect("JSON"), None);
+        let touching = described(|task| task.contact_distances = vec![0.1, 0.2, 0.3]);
+        let key = "description.contact_distances";
+        check(&touching, &plain, &format!("{key} is [0.1, 0.2, 0.3] here and [] in the run"));
+        check(&plain, &touching, &format!("{key} is [] here and [0.1, 0.2, 0.3] in the run"));
+        let changes: [(Change, &str); 2] = [
+            (|task| task.manipulation.shared_object = true, "description.manipulation"),
+            (|task| task.reflection.observation = vec![0], "description.reflection"),
+        ];
+        for (change, key) in changes {
+            let changed = described(change);
+            for (here, there) in [(&changed, &plain), (&plain, &changed)] {
+                let found = first_change(here, &to_json(there)).expect("JSON");
+                assert_eq!(found.expect("it differs").key, key);
+            }
+        }
+        check(&plain, &config(), "description is that of \"push\" here and none in the run");
+        check(&config(), &plain, "description is none here and that of \"push\" in the run");
+        let unknown = to_json(&plain).replace("\"n_goal\"", "\"n_goals\"");
+        let found = first_change(&plain, &unknown).expect("JSON").expect("it cannot be read");
+        assert_eq!((found.key.as_str(), found.here.as_str()), ("description", "that of \"push\""));
+        assert!(found.there.starts_with("unreadable (unknown field `n_goals`"), "{found}");
     }
 
     #[test]

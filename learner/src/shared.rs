@@ -113,7 +113,7 @@ impl State {
     /// Records the end of the run and the workers that have to receive it: those that may be playing, also if their
     /// connections have ended. The others call within the time for which the service stays anyway.
     pub(crate) fn finish(&mut self, end: RunEnd) {
-        let is_playing = |worker: &Worker| worker.slot.is_some() && !worker.silent;
+        let is_playing = |worker: &Worker| worker.slot.is_some() && !worker.reported_silent;
         let playing = self.queue.workers().filter(|(_, worker)| is_playing(worker));
         self.uninformed = playing.map(|(worker_id, _)| worker_id).collect();
         self.end = Some(end);
@@ -126,16 +126,18 @@ impl State {
 }
 
 impl Shared {
-    pub(crate) fn new(clock: Clock, timings: Timings) -> Self {
+    /// Creates the state of a run that has not started.
+    pub(crate) fn new(config: &LearnerConfig, timings: Timings) -> Self {
         let (progress, _) = watch::channel(Progress::default());
+        let queue = WorkQueue::new(config.run.advice.unit, config.first_worker);
         Self {
-            state: Mutex::default(),
+            state: Mutex::new(State { queue, ..State::default() }),
             arrived: Arc::default(),
             work: Notify::new(),
             warnings: Warnings::new(progress.clone()),
             teacher: watch::Sender::default(),
             progress,
-            clock,
+            clock: config.clock.clone(),
             timings,
         }
     }
@@ -161,7 +163,7 @@ impl Shared {
         let n_failures = self.progress.borrow().environment.n_failures;
         if check.failures > 0 && n_failures >= MIN_FAILURES_OF_WARNING {
             let warning = format!(
-                "the environments fail repeatedly, their episodes are played again; one failure, of the server {}",
+                "the environments fail repeatedly, their episodes are played again: one failure, of the server {}",
                 shown(&check.failure)
             );
             self.warnings.set_first(Source::Failures, &warning);

@@ -4,6 +4,7 @@
 //! run directory, and the publisher of the progress.
 
 mod evaluations;
+mod halt;
 mod initial_state;
 mod persistence;
 mod progress_publisher;
@@ -18,14 +19,17 @@ use tandem_rl::trainer::{RoundStats, Trainer};
 use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
 use tokio_util::sync::CancellationToken;
 
-use crate::advice_account::{AdviceAccount, Mismatch, TeacherError};
+use crate::advice_account::{AdviceAccount, Mismatch};
+use crate::checkpoint::RenamedAccount;
 use crate::error::Error;
+use crate::evaluation_store::EvaluationHistory;
 use crate::progress::Phase;
 use crate::runtime::Runtime;
 use crate::shared::{LearnerConfig, Shared};
 use crate::warnings::Source;
 use crate::work_queue::SilentWorker;
 use evaluations::Evaluations;
+use halt::Halt;
 use initial_state::{InitialState, write_run_file};
 use persistence::{LoopState, Persistence};
 use progress_publisher::ProgressPublisher;
@@ -67,19 +71,19 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
         false => initial.open_account(context),
     };
     let account = match account {
-        Err(Error::Teacher(TeacherError::Stopped)) => {
+        Ok(account) => account,
+        Err(Halt::Interrupted) => {
             let (round, digest) = (initial.trainer.counters().round, initial.trainer.digest());
-            let reason = INTERRUPTED.to_owned();
-            RunFinished { reason: &reason, round, digest: &digest }.emit();
-            return Ok(RunOutcome { reason, interrupted: true, digest });
+            return Ok(outcome(None, round, digest));
         }
-        account => account?,
+        Err(Halt::Failed(error)) => return Err(error),
     };
     write_run_file(context.config)?;
     let mut learner = LearnerLoop::new(context, initial, account);
     match learner.run_rounds() {
-        Ok(stop) => learner.finish(stop),
-        Err(error) => {
+        Ok(reason) => learner.finish(Some(reason)),
+        Err(Halt::Interrupted) => learner.finish(None),
+        Err(Halt::Failed(error)) => {
             // A state with numbers that are not finite is useless; a run can resume from any other.
             if !matches!(error, Error::Diverged(_)) {
                 learner.save();
@@ -89,11 +93,12 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
     }
 }
 
-/// The reason for which the loop ends.
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum StopReason {
-    Reached(String),
-    Interrupted,
+/// Reports the end of a run that has reached the limit `reason`, or was interrupted, and returns the outcome.
+fn outcome(reason: Option<String>, round: u64, digest: String) -> RunOutcome {
+    let interrupted = reason.is_none();
+    let reason = reason.unwrap_or_else(|| "interrupted".to_owned());
+    RunFinished { reason: &reason, round, digest: &digest }.emit();
+    RunOutcome { reason, interrupted, digest }
 }
 
 /// The training loop over rounds.
@@ -105,53 +110,50 @@ struct LearnerLoop<'a> {
     account: Option<AdviceAccount>,
     /// The digest of the teacher's policy when the run began, if it is known.
     teacher_policy: Option<String>,
+    /// The account, unless it has the run's name.
+    renamed_account: Option<RenamedAccount>,
     evaluations: Evaluations<'a>,
     persistence: Persistence<'a>,
     progress: ProgressPublisher<'a>,
+    /// Time of the latest check for silent workers.
+    reclaimed_at: Option<Duration>,
 }
 
 impl LearnerLoop<'_> {
-    /// Learns round after round until a limit is reached or the run is interrupted.
-    fn run_rounds(&mut self) -> Result<StopReason, Error> {
+    /// Learns round after round until the run reaches a limit, and returns that limit.
+    fn run_rounds(&mut self) -> Result<String, Halt> {
         // A run that was interrupted while it awaited an evaluation awaits it here: its success may end the run.
-        if !self.complete_overdue_evaluations()? {
-            return Ok(StopReason::Interrupted);
+        self.complete_overdue_evaluations()?;
+        if let Some(reason) = self.reached_limit()? {
+            return Ok(reason);
         }
-        if let Some(stop) = self.stop_reason() {
-            return Ok(stop);
-        }
-        if !self.open_round(self.trainer.counters().round, self.acting.version)? {
-            return Ok(StopReason::Interrupted);
-        }
+        self.open_round(self.trainer.counters().round, self.acting.version)?;
+        self.publish_progress(Phase::Collecting);
         if self.trainer.counters().round == 0 && self.evaluations.is_due(0) {
             self.schedule_evaluation(&self.trainer.stats());
             self.order_evaluation();
         }
         loop {
-            if let Some(stop) = self.stop_reason() {
-                return Ok(stop);
+            if let Some(reason) = self.reached_limit()? {
+                return Ok(reason);
             }
-            if !self.run_round()? {
-                return Ok(StopReason::Interrupted);
-            }
+            self.run_round()?;
             let (persistence, mut state) = self.persistence_and_state();
             persistence.persist_if_due(&mut state);
         }
     }
 
-    /// Awaits the open round, learns from it and opens the next one; returns false if the run is interrupted. After
-    /// false, and after any error but divergence, the run can resume from the present state.
-    fn run_round(&mut self) -> Result<bool, Error> {
+    /// Awaits the open round, learns from it and opens the next one. After an interruption, and after any error but
+    /// divergence, the run can resume from the present state.
+    fn run_round(&mut self) -> Result<(), Halt> {
         let (timings, start) = (&self.context.shared.timings, self.context.shared.timings.now());
-        let Some(episodes) = self.wait_for(EpisodeKind::Training, self.acting.version)? else {
-            return Ok(false);
-        };
+        let episodes = self.wait_for(EpisodeKind::Training, self.acting.version)?;
         timings.record(&timings.collect_seconds, start);
-        let Some(spent) = self.settle(&episodes)? else { return Ok(false) };
+        let spent = self.settle(&episodes)?;
         let round = self.trainer.counters().round;
         let lagged = self.context.config.run.rounds.lag == 1;
-        if lagged && !self.open_round_after(round + 1, round, spent)? {
-            return Ok(false);
+        if lagged {
+            self.open_round_after(round + 1, round, spent)?;
         }
         // Nothing is awaited from here to the end of learning: a round is learned completely or not at all.
         let before = self.trainer.publish();
@@ -162,34 +164,32 @@ impl LearnerLoop<'_> {
         if self.evaluations.is_due(self.trainer.counters().round) {
             self.schedule_evaluation(&stats);
         }
-        if !lagged && !self.open_round(round + 1, round + 1)? {
-            return Ok(false);
+        if !lagged {
+            self.open_round(round + 1, round + 1)?;
         }
         self.order_evaluation();
         timings.record(&timings.round_seconds, start);
         self.complete_overdue_evaluations()
     }
 
-    /// Settles the leases of a round's episodes and returns the units of advice spent so far; `None` if the run is
-    /// interrupted. The teacher's account, not the worker, determines what an episode has cost.
-    fn settle(&mut self, episodes: &[Episode]) -> Result<Option<u64>, Error> {
+    /// Settles the leases of a round's episodes and returns the units of advice spent so far. The teacher's account,
+    /// not the worker, determines what an episode has cost.
+    fn settle(&mut self, episodes: &[Episode]) -> Result<u64, Halt> {
         let spent = self.trainer.counters().advice_spent;
-        let Some(account) = &mut self.account else { return Ok(Some(spent)) };
-        let Some(settlement) = unless_stopped(account.settle(episodes, spent))? else {
-            return Ok(None);
-        };
+        let Some(account) = &mut self.account else { return Ok(spent) };
+        let settlement = account.settle(episodes, spent)?;
         if let Some(Mismatch { claimed, charged }) = settlement.mismatch {
             let (round, name) = (self.trainer.counters().round, account.name());
             let warning = format!(
                 "the episodes of round {round} claim {claimed} units of advice, the teacher's account {name:?} was \
                  charged {charged}: the account counts"
             );
-            self.context.shared.warnings.set_first(Source::Advice, &warning);
+            self.context.shared.warnings.set_first(Source::Claims, &warning);
         }
-        Ok(Some(spent + settlement.units))
+        Ok(spent + settlement.units)
     }
 
-    fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundStats, Error> {
+    fn learn(&mut self, episodes: &[Episode], advice_spent: u64) -> Result<RoundStats, Halt> {
         self.trainer.ingest(episodes);
         self.progress.record_acted(episodes);
         self.trainer.correct_advice_spent(advice_spent);
@@ -215,32 +215,26 @@ impl LearnerLoop<'_> {
         Ok(stats)
     }
 
-    /// Orders the slots of a round, after opening its leases; returns false if the run is interrupted.
-    fn open_round(&mut self, round: u64, version: u64) -> Result<bool, Error> {
+    /// Orders the slots of a round, after opening its leases.
+    fn open_round(&mut self, round: u64, version: u64) -> Result<(), Halt> {
         self.open_round_after(round, version, self.trainer.counters().advice_spent)
     }
 
     /// Does the same as [`Self::open_round`] after `spent` units of advice.
-    fn open_round_after(&mut self, round: u64, version: u64, spent: u64) -> Result<bool, Error> {
-        if self.is_beyond_end(round) {
-            return Ok(true);
+    fn open_round_after(&mut self, round: u64, version: u64, spent: u64) -> Result<(), Halt> {
+        if is_beyond_end(&self.context.config.run, round) {
+            return Ok(());
         }
         let orders = self.trainer.training_orders(round, version);
         if let Some(account) = &mut self.account {
             let payers = payers(&orders, self.context.config.run.advice.unit);
             let units = units_per_episode(&orders, &self.trainer.layout);
-            let opened = account.open_leases(payers, units, spent);
-            let Some(allowances) = unless_stopped(opened)? else { return Ok(false) };
+            let allowances = account.open_leases(payers, units, spent)?;
             let allowances = allowances.iter().map(|each| (each.episode, each.units));
             self.context.shared.lock().queue.limit_claims(allowances);
         }
         self.order(orders);
-        Ok(true)
-    }
-
-    /// Returns true if the limit of environment steps ends the run before `round`.
-    fn is_beyond_end(&self, round: u64) -> bool {
-        is_beyond_end(&self.context.config.run, round)
+        Ok(())
     }
 
     /// Adds slots to the queue and wakes the workers that wait for one.
@@ -251,90 +245,97 @@ impl LearnerLoop<'_> {
         self.context.shared.work.notify_waiters();
     }
 
-    /// Waits for all episodes of `kind` with parameter version `version`; returns `None` if the run is interrupted.
-    fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Option<Vec<Episode>>, Error> {
-        let Context { config, shared, runtime, shutdown } = self.context;
-        let mut checked_at = None;
+    /// Waits for all episodes of `kind` with parameter version `version`.
+    fn wait_for(&mut self, kind: EpisodeKind, version: u64) -> Result<Vec<Episode>, Halt> {
+        let Context { shared, runtime, shutdown, .. } = self.context;
+        let phase = match kind {
+            EpisodeKind::Training => Phase::Collecting,
+            EpisodeKind::Evaluation => Phase::Evaluating,
+        };
         loop {
-            if !self.restore_lost_account()? {
-                return Ok(None);
-            }
+            self.restore_lost_account()?;
+            self.reclaim_slots();
             let mut state = shared.lock();
             if state.queue.is_complete(kind, version) {
-                return Ok(Some(state.queue.take(kind, version)));
-            }
-            if shutdown.is_cancelled() {
-                return Ok(None);
-            }
-            let now = (config.clock)();
-            // The check visits all workers, so it does not run for every slot that arrives.
-            if checked_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
-                checked_at = Some(now);
-                report_silent(&state.queue.reclaim(now));
+                return Ok(state.queue.take(kind, version));
             }
             drop(state);
+            if self.progress.is_due() {
+                self.publish_progress(phase);
+            }
+            if shutdown.is_cancelled() {
+                return Err(Halt::Interrupted);
+            }
             let arrived = shared.arrived.clone();
             let next = async move { tokio::time::timeout(WAIT_TICK, arrived.notified()).await };
             if runtime.wait_on(next).is_none() {
-                return Ok(None);
+                return Err(Halt::Interrupted);
             }
         }
     }
 
-    /// Opens the account again if the teacher has lost it; returns false if the run is interrupted meanwhile.
-    fn restore_lost_account(&mut self) -> Result<bool, Error> {
+    /// Requeues the slots of silent workers and reports these workers. The check visits all workers, so it does not run
+    /// for every slot that arrives.
+    fn reclaim_slots(&mut self) {
+        let now = (self.context.config.clock)();
+        if self.reclaimed_at.is_none_or(|before| now.saturating_sub(before) >= WAIT_TICK) {
+            self.reclaimed_at = Some(now);
+            let fell_silent = self.context.shared.lock().queue.reclaim(now);
+            report_silent(&fell_silent);
+        }
+    }
+
+    /// Opens the account again if the teacher has lost it.
+    fn restore_lost_account(&mut self) -> Result<(), Halt> {
         let spent = self.trainer.counters().advice_spent;
         let Some(account) = self.account.as_mut().filter(|account| account.is_lost()) else {
-            return Ok(true);
+            return Ok(());
         };
         // A reopened account may charge an episode beyond its first lease.
         self.context.shared.lock().queue.lift_claim_limits();
-        Ok(unless_stopped(account.restore_if_lost(spent))?.is_some())
+        Ok(account.restore_if_lost(spent)?)
     }
 
-    fn stop_reason(&self) -> Option<StopReason> {
-        let stop = &self.context.config.run.stop;
+    /// Returns the limit that ends the run now.
+    fn reached_limit(&self) -> Result<Option<String>, Halt> {
         if self.context.shutdown.is_cancelled() {
-            return Some(StopReason::Interrupted);
+            return Err(Halt::Interrupted);
         }
-        if let Some(success) = self.evaluations.history().first_reaching(stop.until_success) {
-            return Some(StopReason::Reached(format!("success rate {success:.3} reached")));
-        }
-        if self.is_beyond_end(self.trainer.counters().round) {
-            let reason = format!("{} environment steps reached", stop.max_env_steps);
-            return Some(StopReason::Reached(reason));
-        }
-        if stop.max_minutes > 0.0 && self.progress.wall_s() >= stop.max_minutes * 60.0 {
-            return Some(StopReason::Reached(format!("{} minutes are over", stop.max_minutes)));
-        }
-        None
+        let (history, round) = (self.evaluations.history(), self.trainer.counters().round);
+        Ok(reached_limit(&self.context.config.run, history, round, self.progress.wall_s()))
     }
 
-    /// Evaluates the final parameters, saves everything and returns the outcome.
-    fn finish(&mut self, stop: StopReason) -> Result<RunOutcome, Error> {
+    /// Evaluates the final parameters of a run that has reached the limit `reason`, saves everything and returns the
+    /// outcome.
+    fn finish(&mut self, mut reason: Option<String>) -> Result<RunOutcome, Error> {
         let round = self.trainer.counters().round;
-        let reached = match stop {
-            StopReason::Interrupted => None,
-            StopReason::Reached(reason) => {
-                if !self.evaluations.covers(round) {
-                    self.schedule_evaluation(&self.trainer.stats());
-                    self.order_evaluation();
-                }
-                // The learning state is saved before anything else is awaited.
-                self.save();
-                self.publish_progress(Phase::Evaluating);
-                while self.complete_evaluation()? {}
-                self.evaluations.pending().is_empty().then_some(reason)
+        if reason.is_some() {
+            match self.complete_all_evaluations() {
+                Ok(()) => {}
+                Err(Halt::Interrupted) => reason = None,
+                Err(Halt::Failed(error)) => return Err(error),
             }
-        };
-        let interrupted = reached.is_none();
-        let reason = reached.unwrap_or_else(|| INTERRUPTED.to_owned());
+        }
         self.save();
-        let digest = self.trainer.digest();
-        RunFinished { reason: &reason, round, digest: &digest }.emit();
+        let outcome = outcome(reason, round, self.trainer.digest());
         self.publish_progress(Phase::Ended);
         self.persistence.check_written()?;
-        Ok(RunOutcome { reason, interrupted, digest })
+        Ok(outcome)
+    }
+
+    /// Evaluates the present parameters and completes all evaluations.
+    fn complete_all_evaluations(&mut self) -> Result<(), Halt> {
+        if !self.evaluations.covers(self.trainer.counters().round) {
+            self.schedule_evaluation(&self.trainer.stats());
+            self.order_evaluation();
+        }
+        // The learning state is saved before anything else is awaited.
+        self.save();
+        self.publish_progress(Phase::Evaluating);
+        while let Some(version) = self.evaluations.oldest_version() {
+            self.complete_evaluation(version)?;
+        }
+        Ok(())
     }
 
     fn schedule_evaluation(&mut self, stats: &RoundStats) {
@@ -349,31 +350,25 @@ impl LearnerLoop<'_> {
         }
     }
 
-    /// Completes the evaluations that must be complete by now; returns false if the run is interrupted.
-    fn complete_overdue_evaluations(&mut self) -> Result<bool, Error> {
-        while self.evaluations.is_overdue(self.trainer.counters().round) {
-            if !self.complete_evaluation()? {
-                return Ok(false);
-            }
+    /// Completes the evaluations that must be complete by now.
+    fn complete_overdue_evaluations(&mut self) -> Result<(), Halt> {
+        while let Some(version) = self.evaluations.overdue_version(self.trainer.counters().round) {
+            self.complete_evaluation(version)?;
         }
-        Ok(true)
+        Ok(())
     }
 
-    /// Waits for the oldest pending evaluation and completes it; returns false if there is none or the run is
-    /// interrupted.
-    fn complete_evaluation(&mut self) -> Result<bool, Error> {
-        let Some(version) = self.evaluations.oldest_version() else { return Ok(false) };
-        let Some(episodes) = self.wait_for(EpisodeKind::Evaluation, version)? else {
-            return Ok(false);
-        };
+    /// Waits for the oldest pending evaluation, that of the parameters `version`, and completes it.
+    fn complete_evaluation(&mut self, version: u64) -> Result<(), Halt> {
+        let episodes = self.wait_for(EpisodeKind::Evaluation, version)?;
         self.evaluations.complete(&episodes);
         self.progress.keep_evaluated(&episodes);
         self.write_records();
         self.progress.publish_evaluations(self.evaluations.history());
-        Ok(true)
+        Ok(())
     }
 
-    fn publish_progress(&self, phase: Phase) {
+    fn publish_progress(&mut self, phase: Phase) {
         self.progress.publish(phase, &self.trainer, &self.trainer.stats());
     }
 
@@ -396,9 +391,28 @@ impl<'a> LearnerLoop<'a> {
             evaluations: &mut self.evaluations,
             wall_s: self.progress.wall_s(),
             teacher_policy: self.teacher_policy.as_deref(),
+            renamed_account: self.renamed_account.as_ref(),
         };
         (&mut self.persistence, state)
     }
+}
+
+/// Returns the limit that a run has reached after `round` rounds and `wall_s` seconds; `None` before its end.
+fn reached_limit(
+    run: &RunConfig,
+    history: &EvaluationHistory,
+    round: u64,
+    wall_s: f64,
+) -> Option<String> {
+    let stop = &run.stop;
+    if let Some(success) = history.first_reaching(stop.until_success) {
+        return Some(format!("success rate {success:.3} reached"));
+    }
+    if is_beyond_end(run, round) {
+        return Some(format!("{} environment steps reached", stop.max_env_steps));
+    }
+    let is_over = stop.max_minutes > 0.0 && wall_s >= stop.max_minutes * 60.0;
+    is_over.then(|| format!("{} minutes are over", stop.max_minutes))
 }
 
 /// Returns true if a run has made its environment steps before `round`.
@@ -442,10 +456,5 @@ fn report_silent(fell_silent: &[SilentWorker]) {
     }
 }
 
-/// Returns the teacher's answer; `None` if the call was cancelled because the run stops.
-fn unless_stopped<T>(outcome: Result<T, TeacherError>) -> Result<Option<T>, TeacherError> {
-    match outcome {
-        Err(TeacherError::Stopped) => Ok(None),
-        outcome => outcome.map(Some),
-    }
-}
+#[cfg(test)]
+mod tests;

@@ -121,7 +121,7 @@ fn worker_state(worker: &Worker, now: Duration) -> WorkerState {
     let is_quiet = now.saturating_sub(worker.last_seen) >= DISCONNECTED_AFTER;
     match worker.slot {
         _ if worker.connection.is_none() && is_quiet => WorkerState::Disconnected,
-        _ if worker.silent => WorkerState::Silent,
+        _ if worker.reported_silent => WorkerState::Silent,
         Some(_) => WorkerState::Playing,
         None => WorkerState::Waiting,
     }

@@ -5,6 +5,7 @@
 //! twice and counts once.
 
 mod check;
+mod connections;
 mod worker;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -13,15 +14,16 @@ use std::time::Duration;
 use tandem_core::work::SlotOrder;
 use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
-pub use check::{SubmitError, check_count};
+pub use check::{QueueError, check_count};
 use check::{check, check_claims};
+use connections::Connection;
 pub use worker::{SilentWorker, Worker};
 
 /// A worker that has not called for this time counts as dead: its slots return to the queue.
 pub const SILENT_AFTER: Duration = Duration::from_secs(15);
-/// A slot that has been assigned for this time, and for twice the recent mean but at most [`SILENT_AFTER`], is also
-/// assigned to a second worker that is idle.
-pub const COVER_AFTER: Duration = Duration::from_secs(3);
+/// A slot that has been assigned for this time, and for twice the recent mean but at most [`SILENT_AFTER`], gets a
+/// backup, as in MapReduce: it is also assigned to an idle worker.
+pub const BACKUP_AFTER: Duration = Duration::from_secs(3);
 /// A worker that has not called for this time is removed. Its episodes still count if they arrive: it may have been
 /// slow and not dead.
 pub const FORGET_AFTER: Duration = Duration::from_secs(600);
@@ -36,8 +38,9 @@ pub const ASK_WITHIN: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub struct WorkQueue {
     next_slot: u64,
-    /// The number after which workers are numbered, and that of the latest worker.
+    /// Worker ids start after this number.
     first_worker: u64,
+    /// The id of the latest worker.
     latest_worker: u64,
     waiting: VecDeque<SlotOrder>,
     assigned: BTreeMap<u64, Assignment>,
@@ -53,8 +56,8 @@ pub struct WorkQueue {
     newcomers: BTreeSet<u64>,
     /// Units of advice that open episodes can claim; an episode without an entry can claim a unit per step.
     claim_limits: BTreeMap<u64, u32>,
-    /// What a unit of advice pays for.
-    pub advice_unit: AdviceUnit,
+    /// The steps that a unit of advice pays for.
+    advice_unit: AdviceUnit,
 }
 
 #[derive(Debug)]
@@ -62,15 +65,6 @@ struct Assignment {
     order: SlotOrder,
     worker: u64,
     since: Duration,
-}
-
-/// An open connection.
-#[derive(Debug, Default)]
-struct Connection {
-    /// The workers that joined over it.
-    workers: BTreeSet<u64>,
-    /// The number of these that have delivered no episodes.
-    n_unproven: usize,
 }
 
 /// A refusal of a join.
@@ -87,6 +81,12 @@ pub enum JoinError {
 }
 
 impl WorkQueue {
+    /// Creates an empty queue whose worker ids start after `first_worker`.
+    #[must_use]
+    pub fn new(advice_unit: AdviceUnit, first_worker: u64) -> Self {
+        Self { advice_unit, first_worker, latest_worker: first_worker, ..Self::default() }
+    }
+
     /// Adds a worker that calls over `connection` and returns its number.
     ///
     /// A connection with too many workers that have delivered nothing loses the oldest of them that plays nothing. A
@@ -111,50 +111,21 @@ impl WorkQueue {
             self.remove_worker(removable.ok_or(JoinError::RunFull)?);
         }
         self.latest_worker += 1;
-        let worker =
-            Worker { name, last_seen: now, n_episodes: 0, slot: None, silent: false, connection };
+        let worker = Worker {
+            name,
+            last_seen: now,
+            n_episodes: 0,
+            slot: None,
+            reported_silent: false,
+            connection: None,
+            reported_slot: None,
+        };
         self.workers.insert(self.latest_worker, worker);
         self.newcomers.insert(self.latest_worker);
         if let Some(connection) = connection {
-            let connection = self.connections.entry(connection).or_default();
-            connection.workers.insert(self.latest_worker);
-            connection.n_unproven += 1;
+            self.attach(self.latest_worker, connection);
         }
         Ok(self.latest_worker)
-    }
-
-    /// Returns the worker that a full queue removes for a worker whose connection has `n_unproven` others that have
-    /// delivered nothing.
-    fn eviction_candidate(&self, n_unproven: usize, now: Duration) -> Option<u64> {
-        let does_not_ask = |id: &&u64| {
-            self.worker(**id)
-                .is_some_and(|worker| now.saturating_sub(worker.last_seen) >= ASK_WITHIN)
-        };
-        let longest_silent = || {
-            let longest = self.workers.iter().min_by_key(|(_, worker)| worker.last_seen);
-            longest.filter(|(_, worker)| is_silent(worker, now)).map(|(id, _)| *id)
-        };
-        let crowded = || {
-            let counted = self.connections.iter().map(|(number, it)| (it.n_unproven, *number));
-            counted.max().filter(|(n, _)| *n > n_unproven + 1).map(|(_, connection)| connection)
-        };
-        self.newcomers
-            .first()
-            .filter(does_not_ask)
-            .copied()
-            .or_else(longest_silent)
-            .or_else(|| self.oldest_idle(crowded()?))
-    }
-
-    fn n_unproven(&self, connection: u64) -> usize {
-        self.connections.get(&connection).map_or(0, |connection| connection.n_unproven)
-    }
-
-    /// Returns the oldest worker of a connection that has delivered nothing and plays nothing.
-    fn oldest_idle(&self, connection: u64) -> Option<u64> {
-        let is_idle = |worker: &Worker| worker.n_episodes == 0 && worker.slot.is_none();
-        let theirs = &self.connections.get(&connection)?.workers;
-        theirs.iter().find(|id| self.worker(**id).is_some_and(is_idle)).copied()
     }
 
     /// Removes a worker; its slot returns to the queue.
@@ -189,6 +160,13 @@ impl WorkQueue {
         }
     }
 
+    /// Returns true if a worker's report on environments that arrives with `slot` is new, and false if the call that
+    /// brought it was repeated or the worker is not known any more.
+    pub fn is_new_report(&mut self, worker_id: u64, slot: u64) -> bool {
+        let worker = self.workers.get_mut(&worker_id);
+        worker.is_some_and(|worker| worker.reported_slot.replace(slot) != Some(slot))
+    }
+
     /// Limits the units of advice that episodes can claim, by episode number.
     pub fn limit_claims(&mut self, limits: impl IntoIterator<Item = (u64, u32)>) {
         self.claim_limits.extend(limits);
@@ -197,11 +175,6 @@ impl WorkQueue {
     /// Lets open episodes claim a unit for each of their steps.
     pub fn lift_claim_limits(&mut self) {
         self.claim_limits.clear();
-    }
-
-    /// Sets the number after which workers are numbered.
-    pub const fn start_workers_at(&mut self, first: u64) {
-        (self.first_worker, self.latest_worker) = (first, first);
     }
 
     /// Adds a slot at the end of the queue and numbers it.
@@ -218,11 +191,7 @@ impl WorkQueue {
     ///
     /// # Errors
     /// When the worker has not joined.
-    pub fn next(
-        &mut self,
-        worker_id: u64,
-        now: Duration,
-    ) -> Result<Option<SlotOrder>, SubmitError> {
+    pub fn next(&mut self, worker_id: u64, now: Duration) -> Result<Option<SlotOrder>, QueueError> {
         self.newcomers.remove(&worker_id);
         let own = self.touch(worker_id, now)?.slot.and_then(|slot| self.assigned.get(&slot));
         if let Some(own) = own.filter(|own| own.worker == worker_id) {
@@ -239,11 +208,11 @@ impl WorkQueue {
     }
 
     /// Records a call of a worker.
-    fn touch(&mut self, worker_id: u64, now: Duration) -> Result<&Worker, SubmitError> {
+    fn touch(&mut self, worker_id: u64, now: Duration) -> Result<&Worker, QueueError> {
         let worker =
-            self.workers.get_mut(&worker_id).ok_or(SubmitError::UnknownWorker(worker_id))?;
+            self.workers.get_mut(&worker_id).ok_or(QueueError::UnknownWorker(worker_id))?;
         worker.last_seen = now;
-        worker.silent = false;
+        worker.reported_silent = false;
         Ok(worker)
     }
 
@@ -287,21 +256,20 @@ impl WorkQueue {
     /// Returns the slot that has been assigned longest, if that is too long.
     fn overdue_slot(&self, now: Duration) -> Option<SlotOrder> {
         let longest = self.longest_assigned()?;
-        let overdue = now.saturating_sub(longest.since) >= self.cover_after();
+        let overdue = now.saturating_sub(longest.since) >= self.backup_after();
         overdue.then(|| longest.order.clone())
     }
 
-    /// Returns the time until a slot is assigned a second time, unless it is delivered before; `None` if no slot is
-    /// assigned.
+    /// Returns the time until the next backup, unless the slot is delivered before; `None` if no slot is assigned.
     #[must_use]
-    pub fn next_cover_in(&self, now: Duration) -> Option<Duration> {
+    pub fn next_backup_in(&self, now: Duration) -> Option<Duration> {
         self.longest_assigned()
-            .map(|longest| (longest.since + self.cover_after()).saturating_sub(now))
+            .map(|longest| (longest.since + self.backup_after()).saturating_sub(now))
     }
 
     /// A worker that repeats the slot of one that is no slower than the others would be missing in the next round.
-    fn cover_after(&self) -> Duration {
-        (2 * self.mean_duration.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER)
+    fn backup_after(&self) -> Duration {
+        (2 * self.mean_duration.unwrap_or_default()).clamp(BACKUP_AFTER, SILENT_AFTER)
     }
 
     /// Returns the order of `slot` for a worker that delivers it; `None` if it was delivered before. The worker may
@@ -314,14 +282,14 @@ impl WorkQueue {
         worker_id: u64,
         slot: u64,
         now: Duration,
-    ) -> Result<Option<&SlotOrder>, SubmitError> {
+    ) -> Result<Option<&SlotOrder>, QueueError> {
         if let Err(unknown) = self.touch(worker_id, now).map(drop)
             && !self.has_joined(worker_id)
         {
             return Err(unknown);
         }
         if slot >= self.next_slot {
-            return Err(SubmitError::UnknownSlot { slot, n_slots: self.next_slot });
+            return Err(QueueError::UnknownSlot { slot, n_slots: self.next_slot });
         }
         let waiting = || self.waiting.iter().find(|order| order.slot == slot);
         Ok(self.assigned.get(&slot).map(|assignment| &assignment.order).or_else(waiting))
@@ -337,7 +305,7 @@ impl WorkQueue {
         slot: u64,
         episodes: Vec<Episode>,
         now: Duration,
-    ) -> Result<bool, SubmitError> {
+    ) -> Result<bool, QueueError> {
         let ordered = self.order_of(worker_id, slot, now)?;
         let is_new = ordered.is_some();
         if let Some(order) = ordered {
@@ -354,21 +322,20 @@ impl WorkQueue {
         Ok(is_new)
     }
 
-    /// Returns the slots of silent workers to their places in the queue, and the workers that fell silent to the
-    /// caller. Removes silent workers that never asked for work, and workers that have been silent for
-    /// [`FORGET_AFTER`].
+    /// Requeues the slots of silent workers and returns those workers. Removes silent workers that never asked for work,
+    /// and workers that have been silent for [`FORGET_AFTER`].
     pub fn reclaim(&mut self, now: Duration) -> Vec<SilentWorker> {
         let never_came = |id: &&u64| self.is_silent(**id, now);
         let never_came: Vec<u64> = self.newcomers.iter().filter(never_came).copied().collect();
         never_came.into_iter().for_each(|id| self.remove_worker(id));
-        let newly = |worker: &Worker| !worker.silent && is_silent(worker, now);
+        let newly = |worker: &Worker| !worker.reported_silent && worker.is_silent(now);
         let silent: Vec<u64> =
             self.workers.iter().filter(|(_, worker)| newly(worker)).map(|(id, _)| *id).collect();
         let mut fell_silent = Vec::new();
         for worker_id in silent {
             let n_slots = self.requeue_slots_of(worker_id);
             if let Some(worker) = self.workers.get_mut(&worker_id) {
-                worker.silent = true;
+                worker.reported_silent = true;
                 worker.slot = None;
                 fell_silent.push(SilentWorker { worker_id, name: worker.name.clone(), n_slots });
             }
@@ -378,31 +345,6 @@ impl WorkQueue {
             self.workers.iter().filter(|(_, worker)| is_gone(worker)).map(|(id, _)| *id).collect();
         gone.into_iter().for_each(|id| self.remove_worker(id));
         fell_silent
-    }
-
-    /// Removes a closed connection, and its workers that never asked for work. Returns the workers whose slots have
-    /// returned to the queue.
-    pub fn remove_connection(&mut self, connection: u64) -> Vec<u64> {
-        let theirs = self.connections.remove(&connection).unwrap_or_default();
-        let mut requeued = Vec::new();
-        for worker_id in theirs.workers {
-            if let Some(worker) = self.workers.get_mut(&worker_id) {
-                worker.connection = None;
-            }
-            if self.newcomers.contains(&worker_id) {
-                self.remove_worker(worker_id);
-            } else if self.release_slot(worker_id) {
-                requeued.push(worker_id);
-            }
-        }
-        requeued
-    }
-
-    /// Returns the slot of a disconnected worker to its place in the queue; returns true if it had one. The worker
-    /// stays: it may call again, and the episodes that it delivers count.
-    pub fn release_slot(&mut self, worker_id: u64) -> bool {
-        self.worker(worker_id).is_some_and(|worker| worker.slot.is_some())
-            && self.requeue_slots_of(worker_id) > 0
     }
 
     fn requeue_slots_of(&mut self, worker_id: u64) -> usize {
@@ -449,7 +391,7 @@ impl WorkQueue {
     /// Returns true if a worker counts as dead; an unknown one does.
     #[must_use]
     pub fn is_silent(&self, worker_id: u64, now: Duration) -> bool {
-        self.worker(worker_id).is_none_or(|worker| is_silent(worker, now))
+        self.worker(worker_id).is_none_or(|worker| worker.is_silent(now))
     }
 
     /// Returns the number of slots that wait for a worker.
@@ -467,17 +409,13 @@ impl WorkQueue {
     /// Returns the number of workers that do not count as dead.
     #[must_use]
     pub fn n_alive(&self, now: Duration) -> usize {
-        self.workers.values().filter(|worker| !is_silent(worker, now)).count()
+        self.workers.values().filter(|worker| !worker.is_silent(now)).count()
     }
 
     /// Returns the workers in the order of their numbers.
     pub fn workers(&self) -> impl Iterator<Item = (u64, &Worker)> {
         self.workers.iter().map(|(id, worker)| (*id, worker))
     }
-}
-
-fn is_silent(worker: &Worker, now: Duration) -> bool {
-    now.saturating_sub(worker.last_seen) >= SILENT_AFTER
 }
 
 #[cfg(test)]

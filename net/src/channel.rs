@@ -43,7 +43,7 @@ pub(crate) struct Target {
     pub(crate) authorization: Option<HeaderValue>,
     /// The first byte that the latest connection received.
     pub(crate) first_byte: FirstByte,
-    /// Where calls are recorded.
+    /// The metrics that record calls.
     pub(crate) metrics: Metrics,
 }
 

@@ -23,7 +23,7 @@ pub struct PolicyDescription {
     pub name: String,
     /// The text that identifies the policy.
     pub digest: String,
-    /// Whether the policy values actions.
+    /// True if the policy values actions.
     pub has_values: bool,
 }
 

@@ -174,7 +174,10 @@ pub(super) fn learner_failed(error: Error) -> Failed {
             | CheckpointError::Config(_),
         ) => Exit::Usage,
         Error::Checkpoint(_) => Exit::Data,
-        Error::RunDirectory { .. } | Error::Serve(_) => Exit::TryAgain,
+        Error::RunDirectory { .. }
+        | Error::Unwritten { .. }
+        | Error::Thread(_)
+        | Error::Serve(_) => Exit::TryAgain,
         Error::ServerConfig(_) | Error::Address(_) => Exit::Usage,
         Error::Diverged(_) | Error::Panicked => Exit::Bug,
     };

@@ -64,16 +64,26 @@ pub fn publish(file: &File, temporary: &Path, path: &Path) -> io::Result<()> {
     sync_parent(path)
 }
 
-/// Creates `directory` with its parents, unless it exists, and syncs the directory that contains it.
+/// Creates `directory` with its parents, unless it exists, and syncs every directory that contains a new one.
 ///
 /// # Errors
 /// When the file system refuses.
 pub fn create_directory(directory: &Path) -> io::Result<()> {
-    if directory.is_dir() {
+    if directory.is_dir() || directory.as_os_str().is_empty() {
         return Ok(());
     }
-    fs::create_dir_all(directory)?;
-    sync_parent(directory)
+    let created = match (fs::create_dir(directory), directory.parent()) {
+        (Err(error), Some(parent)) if error.kind() == io::ErrorKind::NotFound => {
+            create_directory(parent)?;
+            fs::create_dir(directory)
+        }
+        (created, _) => created,
+    };
+    match created {
+        // Another process was faster, whose sync may still be due.
+        Err(error) if !directory.is_dir() => Err(error),
+        _ => sync_parent(directory),
+    }
 }
 
 /// Syncs the names in the directory that contains `path`.
@@ -172,9 +182,17 @@ mod tests {
     #[test]
     fn directories_are_created_once() {
         let directory = tempfile::tempdir().expect("a directory");
-        let path = directory.path().join("a/b");
+        let path = directory.path().join("a/b/c");
         create_directory(&path).expect("creates");
         create_directory(&path).expect("exists");
+        create_directory(&directory.path().join("a/d/../e")).expect("creates");
+        assert_eq!(names(&directory.path().join("a")), ["b", "d", "e"]);
         assert!(path.is_dir());
+        let file = directory.path().join("file");
+        fs::write(&file, "").expect("writes");
+        let error = create_directory(&file).expect_err("a file is in the way");
+        assert_eq!(error.kind(), io::ErrorKind::AlreadyExists);
+        let error = create_directory(&file.join("below")).expect_err("a file is in the way");
+        assert_eq!(error.kind(), io::ErrorKind::NotADirectory);
     }
 }

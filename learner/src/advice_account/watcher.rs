@@ -69,19 +69,28 @@ impl AccountWatcher {
 }
 
 /// Warns if the teacher was restarted with another policy than the `first` one, perhaps for another task: requests for
-/// advice do not name the policy.
+/// advice do not name the policy. The warning remains, with another text, once the first policy is back, because the
+/// run has learned from the other one's advice.
 pub(super) fn warn_of_other_policy(warnings: &Warnings, now: &str, first: &str) {
-    if now == first {
+    let is_first = now == first;
+    if is_first && warnings.of(Source::Policy).is_none() {
         return;
     }
     let shown = |digest: &str| digest.chars().take(N_DIGEST_CHARS).collect::<String>();
-    let warning = format!(
-        "the teacher was restarted with another policy, {} instead of {}, and advises differently: restart it with the \
-         first one",
-        shown(now),
-        shown(first)
-    );
-    warnings.set_first(Source::Policy, &warning);
+    let first = shown(first);
+    let warning = if is_first {
+        format!(
+            "the teacher advised by another policy for a while and has its first one, {first}, again: the run has \
+             learned from the advice of both"
+        )
+    } else {
+        let now = shown(now);
+        format!(
+            "the teacher was restarted with another policy, {now} instead of {first}, and advises differently: restart \
+             it with the first one"
+        )
+    };
+    warnings.set_latest(Source::Policy, &warning);
 }
 
 /// The state of the teacher, as displays and the progress show it.
@@ -149,6 +158,31 @@ mod tests {
 
     use super::*;
     use crate::progress::Progress;
+
+    #[test]
+    fn the_warning_about_another_policy_names_the_latest_one_and_remains() {
+        let (progress, shown) = watch::channel(Progress::default());
+        let warnings = Warnings::new(progress);
+        let other = |now: &str| {
+            format!(
+                "the teacher was restarted with another policy, {now} instead of a1, and advises differently: restart \
+                 it with the first one"
+            )
+        };
+        let both = "the teacher advised by another policy for a while and has its first one, a1, again: the run has \
+                    learned from the advice of both";
+        for (now, expected) in [
+            ("a1", String::new()),
+            ("b2", other("b2")),
+            ("c3", other("c3")),
+            ("a1", both.to_owned()),
+            ("a1", both.to_owned()),
+            ("b2", other("b2")),
+        ] {
+            warn_of_other_policy(&warnings, now, "a1");
+            assert_eq!(shown.borrow().warning, expected);
+        }
+    }
 
     #[test]
     fn a_silent_teacher_is_warned_of_once_and_until_it_answers() {

@@ -8,8 +8,8 @@ use tandem_rl::replay::{ReplayBuffer, ReplayParts};
 use tandem_rl::trainer::{Counters, RoundStats, Trainer};
 use tandem_telemetry::MetricsRow;
 
-use super::Resumption;
 use super::sealed::{Contents, SETTINGS, Tensor};
+use super::{RenamedAccount, Resumption};
 use crate::evaluation_store::{EvaluationHistory, PendingEvaluation};
 use crate::settings;
 
@@ -28,6 +28,9 @@ const JUMP_START: [&str; 4] =
 
 /// Key of the digest of the teacher's policy.
 const TEACHER_POLICY: &str = "teacher_policy";
+/// Keys of the run's account at the teacher, if it does not have the run's name.
+const ACCOUNT_NAME: &str = "advice_account.name";
+const ACCOUNT_BUDGET: &str = "advice_account.budget";
 /// The critics of the gate of the acting parameters, with strategy `ts2c:T`.
 const ACTING_GATE: &str = "acting.gate";
 
@@ -64,6 +67,9 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
     });
     entries.extend(jump_start);
     entries.extend(resumption.teacher_policy.iter().map(|digest| (TEACHER_POLICY, digest.clone())));
+    if let Some(RenamedAccount { name, budget }) = &resumption.account {
+        entries.extend([(ACCOUNT_NAME, name.clone()), (ACCOUNT_BUDGET, budget.to_string())]);
+    }
     entries
 }
 
@@ -201,7 +207,13 @@ impl Reader<'_> {
             pending: self.pending(trainer)?,
             wall_s: wall_s.filter(is_time).ok_or("its wall_s is not a time")?,
             teacher_policy: self.contents.metadata.get(TEACHER_POLICY).cloned(),
+            account: self.account()?,
         })
+    }
+
+    fn account(&self) -> Result<Option<RenamedAccount>, String> {
+        let Some(name) = self.contents.metadata.get(ACCOUNT_NAME) else { return Ok(None) };
+        Ok(Some(RenamedAccount { name: name.clone(), budget: self.count(ACCOUNT_BUDGET)? }))
     }
 
     fn check_run(&self, trainer: &Trainer) -> Result<(), String> {

@@ -3,7 +3,7 @@
 use tandem_proto::DecodeError;
 use tonic::Status;
 
-use crate::work_queue::SubmitError;
+use crate::work_queue::QueueError;
 
 /// Longest label of a worker.
 const MAX_NAME_BYTES: usize = 256;
@@ -56,12 +56,12 @@ pub(super) fn malformed(error: &DecodeError, episode: u64, worker: Option<&Worke
 }
 
 /// Returns the status for a refusal of the work queue.
-pub(super) fn refusal(error: &SubmitError, worker: Option<&Worker>) -> Status {
+pub(super) fn refusal(error: &QueueError, worker: Option<&Worker>) -> Status {
     match error {
-        SubmitError::UnknownWorker(_) => Status::not_found(error.to_string()),
-        SubmitError::UnknownSlot { .. }
-        | SubmitError::WrongCount { .. }
-        | SubmitError::WrongEpisode { .. } => {
+        QueueError::UnknownWorker(_) => Status::not_found(error.to_string()),
+        QueueError::UnknownSlot { .. }
+        | QueueError::WrongCount { .. }
+        | QueueError::WrongEpisode { .. } => {
             Status::invalid_argument(format!("{}{error}", prefix(worker)))
         }
     }

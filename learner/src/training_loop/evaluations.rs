@@ -81,10 +81,10 @@ impl<'a> Evaluations<'a> {
         self.pending.front().map(|pending| pending.counters.round)
     }
 
-    /// Returns true if an evaluation must be complete after `round`. It depends on the round alone, because the
-    /// result of an evaluation may end the run.
-    pub(super) fn is_overdue(&self, round: u64) -> bool {
-        self.oldest_version().is_some_and(|version| round >= version + MAX_PENDING_ROUNDS)
+    /// Returns the parameter version of the oldest evaluation if it must be complete after `round`. That depends on the
+    /// round alone, because the result of an evaluation may end the run.
+    pub(super) fn overdue_version(&self, round: u64) -> Option<u64> {
+        self.oldest_version().filter(|version| round >= version + MAX_PENDING_ROUNDS)
     }
 
     /// Completes the oldest pending evaluation with its episodes: adds its row, and its policy if it is the best.
@@ -195,8 +195,8 @@ fn add_summary(row: &mut MetricsRow, summary: &EvaluationSummary) {
 /// same with more success, or the same with fewer contacts. During the cooldown the policy improves by less than 240
 /// goals can measure, so the later one wins unless the intervals are disjoint.
 ///
-/// If one of them does not tell contacts apart, because the task does not report them or an earlier version made the
-/// evaluation, success takes the place of success without contact.
+/// If one of them does not distinguish contacts between arms from contacts with the table, because the task does not
+/// report contacts or an earlier version made the evaluation, success takes the place of success without contact.
 fn is_better(row: &MetricsRow, than: &MetricsRow, is_cooldown: bool) -> bool {
     let success =
         |row: &MetricsRow| (row.success, Wilson { low: row.success_low, high: row.success_high });

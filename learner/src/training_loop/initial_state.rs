@@ -11,10 +11,11 @@ use tandem_system::atomic_file;
 use tandem_telemetry::events::RunResumed;
 
 use super::evaluations::Evaluations;
+use super::halt::Halt;
 use super::persistence::Persistence;
 use super::progress_publisher::ProgressPublisher;
 use super::run_lock::RunLock;
-use super::{Context, LearnerLoop, is_beyond_end};
+use super::{Context, LearnerLoop, reached_limit};
 use crate::advice_account::{AccountOptions, AdviceAccount, RunStart};
 use crate::checkpoint::{self, CheckpointError, Restored, Resumption};
 use crate::error::Error;
@@ -33,7 +34,7 @@ pub(super) struct InitialState {
     pub(super) trainer: Trainer,
     resumption: Resumption,
     is_resumed: bool,
-    /// Whether the run was started before.
+    /// True if the run was started before.
     was_started: bool,
     lock: RunLock,
 }
@@ -73,19 +74,15 @@ impl InitialState {
         Ok(Self { trainer, resumption, is_resumed, was_started, lock })
     }
 
-    /// Returns true if the run has reached one of its ends.
+    /// Returns true if the run has reached one of its limits.
     pub(super) fn is_complete(&self, config: &LearnerConfig) -> bool {
-        let stop = &config.run.stop;
-        self.resumption.history.first_reaching(stop.until_success).is_some()
-            || is_beyond_end(&config.run, self.trainer.counters().round)
-            || (stop.max_minutes > 0.0 && self.resumption.wall_s >= stop.max_minutes * 60.0)
+        let Resumption { history, wall_s, .. } = &self.resumption;
+        let round = self.trainer.counters().round;
+        reached_limit(&config.run, history, round, *wall_s).is_some()
     }
 
     /// Opens the run's account at the teacher if the run asks for advice.
-    pub(super) fn open_account(
-        &self,
-        context: Context<'_>,
-    ) -> Result<Option<AdviceAccount>, Error> {
+    pub(super) fn open_account(&self, context: Context<'_>) -> Result<Option<AdviceAccount>, Halt> {
         let config = context.config;
         let advice = &config.run.advice;
         if !advice.asks() {
@@ -104,6 +101,7 @@ impl InitialState {
                 budget: config.run.advice_budget(),
                 strategy: advice.strategy.clone(),
             },
+            renamed: self.resumption.account.clone(),
             first_policy: self.resumption.teacher_policy.clone(),
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),
@@ -166,8 +164,10 @@ impl<'a> LearnerLoop<'a> {
     ) -> Self {
         let Context { config, shared, .. } = context;
         let InitialState { trainer, resumption, lock, .. } = initial;
-        let Resumption { acting, history, pending, wall_s, teacher_policy } = resumption;
+        let Resumption { acting, history, pending, wall_s, teacher_policy, account: renamed } =
+            resumption;
         let policy = account.as_ref().and_then(AdviceAccount::policy).map(str::to_owned);
+        let renamed_account = account.as_ref().and_then(AdviceAccount::renamed).or(renamed);
         let terms = RunTerms {
             run: config.run.name.clone(),
             layout: trainer.layout.clone(),
@@ -177,7 +177,6 @@ impl<'a> LearnerLoop<'a> {
             world: config.run.world,
             symmetrized_evaluation: config.run.evaluation.symmetrized,
         };
-        shared.lock().queue.advice_unit = terms.advice.unit;
         publish_parameters(context, &pending, &acting, &trainer);
         // The clock counts from the start of this process, and the run's wall time continues that of its earlier parts.
         let started_s = config.unix_start.as_secs_f64() - wall_s;
@@ -187,9 +186,11 @@ impl<'a> LearnerLoop<'a> {
             acting,
             account,
             teacher_policy: policy.or(teacher_policy),
+            renamed_account,
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),
             progress: ProgressPublisher::new(config, shared, wall_s),
+            reclaimed_at: None,
         };
         for pending in learner.evaluations.pending() {
             learner.order(learner.trainer.evaluation_orders(pending.counters.round));

@@ -9,7 +9,7 @@ use tandem_telemetry::events::CheckpointSaved;
 
 use super::evaluations::Evaluations;
 use super::run_lock::RunLock;
-use crate::checkpoint::{self, Resumption, Saved};
+use crate::checkpoint::{self, RenamedAccount, Resumption, Saved};
 use crate::error::Error;
 use crate::evaluation_store::{UnwrittenFile, innermost};
 use crate::shared::{LearnerConfig, Shared};
@@ -18,6 +18,8 @@ use crate::warnings::{Source, Warnings};
 
 /// Pause before a failed write is repeated.
 const RETRY_AFTER_S: f64 = 10.0;
+/// Wall time of the run that may be missing in its final checkpoint.
+const MAX_UNSAVED_S: f64 = 1.0;
 
 /// The cause of a write that is not attempted because another run may use the path now.
 const DISPLACED: &str = "the run directory was moved, removed or replaced";
@@ -37,6 +39,7 @@ pub(super) struct LoopState<'a, 'c> {
     pub(super) evaluations: &'a mut Evaluations<'c>,
     pub(super) wall_s: f64,
     pub(super) teacher_policy: Option<&'a str>,
+    pub(super) renamed_account: Option<&'a RenamedAccount>,
 }
 
 impl LoopState<'_, '_> {
@@ -57,9 +60,13 @@ pub(super) struct Persistence<'a> {
     lock: RunLock,
     /// The state in the newest checkpoint.
     saved: Option<CheckpointKey>,
+    /// Wall time in the newest checkpoint.
+    saved_wall_s: f64,
     unwritten_checkpoint: Option<UnwrittenFile>,
     unwritten_records: Vec<UnwrittenFile>,
-    last_attempt_s: f64,
+    /// Wall time of the latest attempts to write a checkpoint and the records.
+    checkpoint_attempt_s: f64,
+    records_attempt_s: f64,
     /// The trouble that was logged last.
     logged_trouble: String,
 }
@@ -72,9 +79,11 @@ impl<'a> Persistence<'a> {
             timings: &shared.timings,
             lock,
             saved: None,
+            saved_wall_s: 0.0,
             unwritten_checkpoint: None,
             unwritten_records: Vec::new(),
-            last_attempt_s: 0.0,
+            checkpoint_attempt_s: 0.0,
+            records_attempt_s: 0.0,
             logged_trouble: String::new(),
         }
     }
@@ -83,25 +92,27 @@ impl<'a> Persistence<'a> {
     pub(super) fn persist_if_due(&mut self, state: &mut LoopState<'_, '_>) {
         let round = state.trainer.counters().round;
         let is_due = round.is_multiple_of(self.config.run.checkpoint.every_rounds);
-        let is_retry = state.wall_s >= self.last_attempt_s + RETRY_AFTER_S;
-        if is_due || (is_retry && self.unwritten_checkpoint.is_some()) {
+        let is_retry = |attempt_s: f64| state.wall_s >= attempt_s + RETRY_AFTER_S;
+        let is_unwritten = self.unwritten_checkpoint.is_some();
+        if is_due || (is_unwritten && is_retry(self.checkpoint_attempt_s)) {
             self.save(state);
-        } else if is_retry && state.evaluations.has_unwritten() {
+        } else if state.evaluations.has_unwritten() && is_retry(self.records_attempt_s) {
             self.write_records(state.evaluations, state.wall_s);
         }
     }
 
-    /// Saves a checkpoint unless the newest one contains this state, and writes the records. A failure leaves the
-    /// former checkpoint in place.
+    /// Saves a checkpoint unless the newest one contains this state and the run's wall time, and writes the records. A
+    /// failure leaves the former checkpoint in place.
     pub(super) fn save(&mut self, state: &mut LoopState<'_, '_>) {
         let key = state.key();
-        if self.saved != Some(key) {
+        if self.saved != Some(key) || state.wall_s > self.saved_wall_s + MAX_UNSAVED_S {
             self.save_checkpoint(key, state);
         }
         self.write_records(state.evaluations, state.wall_s);
     }
 
     fn save_checkpoint(&mut self, key: CheckpointKey, state: &LoopState<'_, '_>) {
+        self.checkpoint_attempt_s = state.wall_s;
         let what = format!("the checkpoint of round {}", key.round);
         if !self.lock.is_in_place() {
             let cause = DISPLACED.to_owned();
@@ -114,6 +125,7 @@ impl<'a> Persistence<'a> {
             pending: state.evaluations.pending().iter().cloned().collect(),
             wall_s: state.wall_s,
             teacher_policy: state.teacher_policy.map(str::to_owned),
+            account: state.renamed_account.cloned(),
         };
         let directory = self.config.out.join("checkpoint");
         let keep = self.config.run.checkpoint.keep;
@@ -122,7 +134,7 @@ impl<'a> Persistence<'a> {
             Ok(Saved { path, seal }) => {
                 self.timings.record(&self.timings.checkpoint_seconds, start);
                 CheckpointSaved { round: key.round, path: &path, digest: &seal }.emit();
-                self.saved = Some(key);
+                (self.saved, self.saved_wall_s) = (Some(key), state.wall_s);
                 self.unwritten_checkpoint = None;
             }
             Err(error) => {
@@ -141,7 +153,7 @@ impl<'a> Persistence<'a> {
             let (what, cause) = ("metrics.jsonl and policies".to_owned(), DISPLACED.to_owned());
             self.unwritten_records = vec![UnwrittenFile { what, cause }];
         }
-        self.last_attempt_s = wall_s;
+        self.records_attempt_s = wall_s;
         let trouble = self.trouble();
         if trouble == self.logged_trouble {
             return;
@@ -164,8 +176,7 @@ impl<'a> Persistence<'a> {
         if trouble.is_empty() {
             return Ok(());
         }
-        let path = self.config.out.clone();
-        Err(Error::RunDirectory { action: "write everything to", path, source: trouble.into() })
+        Err(Error::Unwritten { out: self.config.out.clone(), trouble })
     }
 
     /// Returns the files that cannot be written and the causes; empty if there are none.

@@ -13,8 +13,8 @@ use crate::work_queue::{WorkQueue, Worker};
 
 /// Time span over which rates are measured.
 const RATE_SPAN_S: f64 = 15.0;
-/// Shortest time between two snapshots during the updates of a round.
-const UPDATE_PERIOD_S: f64 = 1.0;
+/// Shortest time between two snapshots during the updates of a round, and while episodes are awaited.
+const PERIOD_S: f64 = 1.0;
 /// Episodes of the latest evaluation that are kept for displays.
 const KEPT_EPISODES: usize = 4;
 
@@ -26,6 +26,8 @@ pub(super) struct ProgressPublisher<'a> {
     wall_before_s: f64,
     /// The ends of recent rounds, oldest first.
     samples: VecDeque<RateSample>,
+    /// Wall time of the latest snapshot.
+    published_at_s: f64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -50,7 +52,8 @@ impl<'a> ProgressPublisher<'a> {
         shared: &'a Shared,
         wall_before_s: f64,
     ) -> Self {
-        Self { config, shared, wall_before_s, samples: VecDeque::new() }
+        let published_at_s = wall_before_s;
+        Self { config, shared, wall_before_s, samples: VecDeque::new(), published_at_s }
     }
 
     /// Returns the wall time of the run so far, seconds, summed over resumed parts.
@@ -58,11 +61,18 @@ impl<'a> ProgressPublisher<'a> {
         self.wall_before_s + (self.config.clock)().as_secs_f64()
     }
 
+    /// Returns true about a second after the latest snapshot.
+    pub(super) fn is_due(&self) -> bool {
+        self.wall_s() - self.published_at_s >= PERIOD_S
+    }
+
     /// Publishes the state of the run.
-    pub(super) fn publish(&self, phase: Phase, trainer: &Trainer, stats: &RoundStats) {
+    pub(super) fn publish(&mut self, phase: Phase, trainer: &Trainer, stats: &RoundStats) {
         let counters = trainer.counters();
         let run = &self.config.run;
-        let rates = self.rates();
+        let now_s = self.wall_s();
+        self.published_at_s = now_s;
+        let rates = rates(&self.samples, now_s);
         let mut state = self.shared.lock();
         state.n_replay_episodes = trainer.replay.n_episodes();
         let workers = workers(&state.queue);
@@ -77,7 +87,7 @@ impl<'a> ProgressPublisher<'a> {
             progress.max_env_steps = run.stop.max_env_steps;
             progress.max_minutes = run.stop.max_minutes;
             progress.counters = counters;
-            progress.wall_s = self.wall_s();
+            progress.wall_s = now_s;
             progress.wall_before_s = self.wall_before_s;
             progress.env_steps_per_s = rates.env_steps_per_s;
             progress.updates_per_s = rates.updates_per_s;
@@ -122,7 +132,7 @@ impl<'a> ProgressPublisher<'a> {
             let now_s = self.wall_s();
             self.shared.timings.update_seconds.observe(now_s - updated_at_s);
             updated_at_s = now_s;
-            if now_s - published_at_s > UPDATE_PERIOD_S {
+            if now_s - published_at_s > PERIOD_S {
                 published_at_s = now_s;
                 self.shared.progress.send_modify(|progress| {
                     progress.counters.updates = learned.updates + n_updates;
@@ -142,20 +152,23 @@ impl<'a> ProgressPublisher<'a> {
             self.samples.pop_front();
         }
     }
+}
 
-    /// Returns recent rates.
-    fn rates(&self) -> Rates {
-        match (self.samples.front(), self.samples.back()) {
-            (Some(first), Some(last)) if last.wall_s > first.wall_s => {
-                let span_s = last.wall_s - first.wall_s;
-                Rates {
-                    env_steps_per_s: (last.env_steps - first.env_steps) as f64 / span_s,
-                    updates_per_s: (last.updates - first.updates) as f64 / span_s,
-                    advice_per_min: (last.advice_spent - first.advice_spent) as f64 * 60.0 / span_s,
-                }
-            }
-            _ => Rates::default(),
-        }
+/// Returns the rates between the first and the last of `samples`. They are 0 once the last one is older than
+/// [`RATE_SPAN_S`] and than two rounds of recent length: the run waits.
+fn rates(samples: &VecDeque<RateSample>, now_s: f64) -> Rates {
+    let (Some(first), Some(last)) = (samples.front(), samples.back()) else {
+        return Rates::default();
+    };
+    let span_s = last.wall_s - first.wall_s;
+    let round_s = span_s / (samples.len() - 1).max(1) as f64;
+    if span_s <= 0.0 || now_s - last.wall_s > RATE_SPAN_S.max(2.0 * round_s) {
+        return Rates::default();
+    }
+    Rates {
+        env_steps_per_s: (last.env_steps - first.env_steps) as f64 / span_s,
+        updates_per_s: (last.updates - first.updates) as f64 / span_s,
+        advice_per_min: (last.advice_spent - first.advice_spent) as f64 * 60.0 / span_s,
     }
 }
 
@@ -179,9 +192,10 @@ fn count_acted(acted: &mut Vec<ActedSteps>, episode: &Episode) {
 
 /// Returns the workers, without a silent one whose name an active one has: that is a restarted worker.
 fn workers(queue: &WorkQueue) -> Vec<WorkerProgress> {
-    let active = queue.workers().filter(|(_, worker)| !worker.silent);
+    let active = queue.workers().filter(|(_, worker)| !worker.reported_silent);
     let active: BTreeSet<&str> = active.map(|(_, worker)| worker.name.as_str()).collect();
-    let is_shown = |worker: &Worker| !worker.silent || !active.contains(worker.name.as_str());
+    let is_shown =
+        |worker: &Worker| !worker.reported_silent || !active.contains(worker.name.as_str());
     let shown = queue.workers().filter(|(_, worker)| is_shown(worker));
     let progress = |(worker_id, worker): (u64, &Worker)| WorkerProgress {
         worker_id,
@@ -194,7 +208,7 @@ fn workers(queue: &WorkQueue) -> Vec<WorkerProgress> {
 
 fn activity(worker: &Worker) -> Activity {
     match worker.slot {
-        _ if worker.silent => Activity::Silent,
+        _ if worker.reported_silent => Activity::Silent,
         Some(slot) => Activity::Slot(slot),
         None => Activity::Waiting,
     }
@@ -205,6 +219,26 @@ mod tests {
     use tandem_core::{Layout, Task};
 
     use super::*;
+
+    #[test]
+    fn rates_are_0_while_a_run_waits_for_longer_than_two_rounds_take() {
+        let samples = |every_s: f64| -> VecDeque<RateSample> {
+            let sample = |n: u64| RateSample {
+                wall_s: every_s * n as f64,
+                env_steps: 100 * n,
+                updates: 10 * n,
+                advice_spent: n,
+            };
+            (0..3).map(sample).collect()
+        };
+        let env_steps_per_s = |every_s, now_s| rates(&samples(every_s), now_s).env_steps_per_s;
+        assert_eq!(env_steps_per_s(2.0, 4.0), 50.0);
+        assert_eq!(env_steps_per_s(2.0, 19.0), 50.0);
+        assert_eq!(env_steps_per_s(2.0, 19.5), 0.0);
+        assert_eq!(env_steps_per_s(50.0, 200.0), 2.0, "a slow round");
+        assert_eq!(env_steps_per_s(50.0, 201.0), 0.0);
+        assert_eq!(rates(&samples(2.0).range(..1).copied().collect(), 0.0).updates_per_s, 0.0);
+    }
 
     #[test]
     fn steps_are_counted_by_arm_and_by_who_acted() {

@@ -7,7 +7,7 @@ use tandem_core::{AdviceUnit, Episode, EpisodeKind};
 
 /// A refusal of a worker's call or episodes. None of the episodes is used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum SubmitError {
+pub enum QueueError {
     /// The worker must join first.
     #[error("worker {0} is unknown here: join first")]
     UnknownWorker(u64),
@@ -47,19 +47,19 @@ pub enum SubmitError {
 ///
 /// # Errors
 /// When it differs from the order.
-pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), SubmitError> {
+pub fn check_count(order: &SlotOrder, got: usize) -> Result<(), QueueError> {
     let expected = order.episodes.len();
     if got == expected {
         return Ok(());
     }
-    Err(SubmitError::WrongCount { slot: order.slot, expected, got })
+    Err(QueueError::WrongCount { slot: order.slot, expected, got })
 }
 
 pub(super) fn check(
     order: &SlotOrder,
     unit: AdviceUnit,
     episodes: &[Episode],
-) -> Result<(), SubmitError> {
+) -> Result<(), QueueError> {
     check_count(order, episodes.len())?;
     let ordered = || episodes.iter().zip(&order.episodes);
     ordered().try_for_each(|(episode, ordered)| check_episode(order, ordered, episode))?;
@@ -88,12 +88,12 @@ fn n_advised_steps(episodes: &[&Episode]) -> usize {
 
 /// Checks that an advised episode claims `n_advised` units: a unit pays for one step, regardless of the number of
 /// overridden arms, and a step without an overridden arm costs nothing.
-fn check_claim(episode: &Episode, n_advised: usize) -> Result<(), SubmitError> {
+fn check_claim(episode: &Episode, n_advised: usize) -> Result<(), QueueError> {
     let claimed = episode.advice_charged;
     if usize::try_from(claimed) == Ok(n_advised) {
         return Ok(());
     }
-    Err(SubmitError::WrongEpisode {
+    Err(QueueError::WrongEpisode {
         number: episode.number,
         field: "advice_charged",
         expected: format!("{n_advised}, the steps with an advised arm"),
@@ -105,9 +105,9 @@ fn check_episode(
     order: &SlotOrder,
     ordered: &EpisodeOrder,
     episode: &Episode,
-) -> Result<(), SubmitError> {
+) -> Result<(), QueueError> {
     let refuse = |field, expected: String, got: String| {
-        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
+        Err(QueueError::WrongEpisode { number: episode.number, field, expected, got })
     };
     let (number, version) = (episode.number, episode.parameter_version);
     if number != ordered.number {
@@ -128,9 +128,9 @@ fn check_advice(
     order: &SlotOrder,
     ordered: &EpisodeOrder,
     episode: &Episode,
-) -> Result<(), SubmitError> {
+) -> Result<(), QueueError> {
     let refuse = |field, expected, got| {
-        Err(SubmitError::WrongEpisode { number: episode.number, field, expected, got })
+        Err(QueueError::WrongEpisode { number: episode.number, field, expected, got })
     };
     if ordered.advised && order.kind == EpisodeKind::Training {
         let mut steps = episode.advised_arms.iter().enumerate();
@@ -163,7 +163,7 @@ pub(super) fn check_claims(
     limits: &BTreeMap<u64, u32>,
     order: &SlotOrder,
     episodes: &[Episode],
-) -> Result<(), SubmitError> {
+) -> Result<(), QueueError> {
     // Evaluation episodes are numbered separately and claim nothing.
     if order.kind != EpisodeKind::Training {
         return Ok(());
@@ -171,7 +171,7 @@ pub(super) fn check_claims(
     for episode in episodes {
         let (number, claimed) = (episode.number, episode.advice_charged);
         if let Some(units) = limits.get(&number).filter(|units| claimed > **units) {
-            return Err(SubmitError::WrongEpisode {
+            return Err(QueueError::WrongEpisode {
                 number,
                 field: "advice_charged",
                 expected: format!("at most {units}, the units reserved for it"),

@@ -2,6 +2,7 @@
 
 mod lock_steps;
 mod model;
+mod reconnected;
 mod removed;
 
 use tandem_core::work::{EpisodeExploration, EpisodeOrder};
@@ -95,8 +96,8 @@ fn training_comes_before_evaluation() {
 fn a_slot_delivered_twice_counts_once() {
     let (mut queue, a, b) = queue_of(1);
     assert_eq!(next_slot(&mut queue, a, at(0)), Some(0));
-    assert_eq!(next_slot(&mut queue, b, at(1)), None, "too early to cover");
-    assert_eq!(next_slot(&mut queue, b, at(4)), Some(0), "covers");
+    assert_eq!(next_slot(&mut queue, b, at(1)), None, "too early for a backup");
+    assert_eq!(next_slot(&mut queue, b, at(4)), Some(0), "as a backup");
     assert_eq!(queue.submit(b, 0, played(0), at(5)), Ok(true));
     assert_eq!(queue.submit(a, 0, played(0), at(6)), Ok(false));
     assert_eq!(taken(&mut queue), [0]);
@@ -108,11 +109,18 @@ fn a_slot_delivered_twice_counts_once() {
 fn a_dead_workers_slot_is_reassigned_after_three_seconds() {
     let (mut queue, a, b) = queue_of(1);
     next_slot(&mut queue, a, at(0));
-    assert_eq!(queue.next_cover_in(Duration::from_millis(1200)), Some(Duration::from_millis(1800)));
-    assert_eq!(queue.next_cover_in(at(9)), Some(Duration::ZERO));
+    assert_eq!(
+        queue.next_backup_in(Duration::from_millis(1200)),
+        Some(Duration::from_millis(1800))
+    );
+    assert_eq!(queue.next_backup_in(at(9)), Some(Duration::ZERO));
     assert_eq!(next_slot(&mut queue, b, Duration::from_millis(2999)), None);
-    assert_eq!(next_slot(&mut queue, b, COVER_AFTER), Some(0));
-    assert_eq!(queue.next_cover_in(COVER_AFTER), Some(COVER_AFTER), "the cover has its own time");
+    assert_eq!(next_slot(&mut queue, b, BACKUP_AFTER), Some(0));
+    assert_eq!(
+        queue.next_backup_in(BACKUP_AFTER),
+        Some(BACKUP_AFTER),
+        "the backup has its own time"
+    );
 }
 
 #[test]
@@ -123,7 +131,7 @@ fn slow_slots_are_reassigned_after_twice_their_mean_time() {
         (Some(0), Some(1))
     );
     assert_eq!(queue.submit(a, 0, played(0), at(5)), Ok(true));
-    assert_eq!(queue.next_cover_in(at(5)), Some(at(5)));
+    assert_eq!(queue.next_backup_in(at(5)), Some(at(5)));
     assert_eq!(next_slot(&mut queue, a, at(9)), None, "the other is as slow as this one");
     assert_eq!(next_slot(&mut queue, a, at(10)), Some(1), "the other is slower");
 }
@@ -167,8 +175,8 @@ fn a_worker_that_never_delivers_holds_one_slot_for_a_short_time() {
         assert_eq!(next_slot(&mut queue, good, at(1)), Some(slot));
         assert_eq!(queue.submit(good, slot, played(slot), at(1)), Ok(true));
     }
-    assert_eq!(next_slot(&mut queue, bad, COVER_AFTER), Some(0));
-    assert_eq!(next_slot(&mut queue, good, COVER_AFTER), Some(0), "however often the other asks");
+    assert_eq!(next_slot(&mut queue, bad, BACKUP_AFTER), Some(0));
+    assert_eq!(next_slot(&mut queue, good, BACKUP_AFTER), Some(0), "however often the other asks");
     assert_eq!(queue.submit(good, 0, played(0), at(4)), Ok(true));
     assert_eq!(taken(&mut queue), [0, 1, 2]);
 }
@@ -211,7 +219,7 @@ fn a_live_worker_replaces_a_silent_one_in_a_full_run() {
     let newest = join(&mut queue, at(0) + SILENT_AFTER);
     assert_eq!(queue.workers.len(), MAX_WORKERS);
     assert_eq!((queue.n_waiting(), queue.n_assigned()), (1, 0), "its slot is free at once");
-    assert_eq!(queue.next(first, at(16)), Err(SubmitError::UnknownWorker(first)));
+    assert_eq!(queue.next(first, at(16)), Err(QueueError::UnknownWorker(first)));
     assert_eq!(next_slot(&mut queue, newest, at(16)), Some(0), "the forgotten worker's slot");
 }
 
@@ -249,7 +257,7 @@ fn one_connection_cannot_crowd_out_others() {
         last = join_over(1, at(0));
     }
     assert_eq!(queue.workers.len(), MAX_UNPROVEN_PER_CONNECTION + 1);
-    assert_eq!(queue.next(first, at(0)), Err(SubmitError::UnknownWorker(first)));
+    assert_eq!(queue.next(first, at(0)), Err(QueueError::UnknownWorker(first)));
     assert_eq!(queue.next(last, at(0)), Ok(None));
     assert_eq!(queue.next(honest, at(0)), Ok(None));
 }
@@ -295,7 +303,7 @@ fn a_worker_that_only_repeated_deliveries_counts_as_unproven() {
     assert_eq!(queue.submit(other, 0, played(0), at(1)), Ok(true));
     assert_eq!(queue.submit(workers[0], 0, played(0), at(1)), Ok(false));
     assert!(queue.join("w".to_owned(), Some(1), at(1)).is_ok());
-    assert_eq!(queue.next(workers[0], at(1)), Err(SubmitError::UnknownWorker(workers[0])));
+    assert_eq!(queue.next(workers[0], at(1)), Err(QueueError::UnknownWorker(workers[0])));
 }
 
 #[test]
@@ -343,7 +351,7 @@ fn a_silent_worker_is_listed_and_does_not_count_as_alive() {
 fn a_disconnected_worker_does_not_return_a_reassigned_slot() {
     let (mut queue, a, b) = queue_of(1);
     next_slot(&mut queue, a, at(0));
-    assert_eq!(next_slot(&mut queue, b, COVER_AFTER), Some(0), "covers");
+    assert_eq!(next_slot(&mut queue, b, BACKUP_AFTER), Some(0), "as a backup");
     assert!(!queue.release_slot(a), "the slot is with the other");
     assert_eq!((queue.n_waiting(), queue.n_assigned()), (0, 1));
 }
@@ -351,12 +359,11 @@ fn a_disconnected_worker_does_not_return_a_reassigned_slot() {
 #[test]
 fn a_worker_of_an_earlier_start_is_unknown() {
     let earlier = join(&mut WorkQueue::default(), at(0));
-    let mut queue = WorkQueue::default();
-    queue.start_workers_at(4096);
+    let mut queue = WorkQueue::new(AdviceUnit::EnvStep, 4096);
     queue.push(order(0, EpisodeKind::Training));
     let later = join(&mut queue, at(0));
     for stranger in [earlier, 4096, later + 1] {
-        let unknown = SubmitError::UnknownWorker(stranger);
+        let unknown = QueueError::UnknownWorker(stranger);
         assert_eq!(queue.next(stranger, at(0)), Err(unknown.clone()));
         assert_eq!(queue.submit(stranger, 0, played(0), at(0)), Err(unknown));
     }
@@ -382,25 +389,6 @@ fn a_full_queue_removes_a_worker_of_the_largest_connection() {
     }
     let refused = alone.join("w".to_owned(), Some(50_000), at(1));
     assert_eq!(refused, Err(JoinError::RunFull), "no connection has more than this one would have");
-}
-
-#[test]
-fn joins_end_with_their_connection() {
-    let mut queue = WorkQueue::default();
-    queue.push(order(0, EpisodeKind::Training));
-    let joined: Vec<u64> =
-        (0..3).map(|_| queue.join("w".to_owned(), Some(7), at(0)).expect("room")).collect();
-    let other = queue.join("w".to_owned(), Some(8), at(0)).expect("room");
-    assert_eq!(next_slot(&mut queue, joined[0], at(0)), Some(0));
-    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
-    assert_eq!(queue.remove_connection(7), [joined[0]], "it had a slot");
-    assert_eq!(queue.next(joined[2], at(0)), Err(SubmitError::UnknownWorker(joined[2])));
-    assert_eq!(next_slot(&mut queue, other, at(0)), Some(0));
-    // Those that were only cut off call again over another connection.
-    assert_eq!(next_slot(&mut queue, joined[1], at(0)), None);
-    assert_eq!(queue.submit(joined[0], 0, played(0), at(1)), Ok(true));
-    assert_eq!(queue.remove_connection(7), [0; 0], "that is known");
-    assert_eq!(queue.remove_connection(99), [0; 0], "a strange one");
 }
 
 /// An advised training slot of one episode, and an episode that claims `charged` units with these arms advised.
@@ -488,6 +476,6 @@ fn episodes_that_do_not_match_the_order_are_refused_by_name() {
         |all| all[0].advised_arms[7] = 1,
         "episode 0: advised_arms: expected no advised arm, as no advice was ordered, got 0b00000001 on step 7",
     );
-    assert_eq!(queue.submit(77, 0, played(0), at(0)), Err(SubmitError::UnknownWorker(77)));
+    assert_eq!(queue.submit(77, 0, played(0), at(0)), Err(QueueError::UnknownWorker(77)));
     assert_eq!(queue.submit(a, 0, played(0), at(0)), Ok(true), "the worker may try again");
 }

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use super::SILENT_AFTER;
+
 /// A worker that has joined the run.
 #[derive(Debug, Clone)]
 pub struct Worker {
@@ -13,10 +15,20 @@ pub struct Worker {
     pub n_episodes: u64,
     /// The slot assigned to it last, until it delivers the episodes. A disconnected worker may still be playing it.
     pub slot: Option<u64>,
-    /// True if it counts as dead.
-    pub silent: bool,
-    /// The connection over which it joined, while that is open.
+    /// True from its report as silent until its next call.
+    pub reported_silent: bool,
+    /// The connection over which it joined, or asked for work since, while that is open.
     pub connection: Option<u64>,
+    /// The slot with which its latest report on environments arrived.
+    pub reported_slot: Option<u64>,
+}
+
+impl Worker {
+    /// Returns true if it counts as dead at `now`.
+    #[must_use]
+    pub fn is_silent(&self, now: Duration) -> bool {
+        now.saturating_sub(self.last_seen) >= SILENT_AFTER
+    }
 }
 
 /// A worker that counts as dead.

@@ -42,12 +42,22 @@ pub(crate) fn with_teacher(
 
 /// Charges the advised episodes of a slot, waiting for a teacher that does not know the account.
 pub(crate) async fn charge(teacher: &FakeTeacher, order: &SlotOrder, episodes: &mut [Episode]) {
+    charge_to("toy", teacher, order, episodes).await;
+}
+
+/// Charges the advised episodes of a slot to `account`.
+async fn charge_to(
+    account: &str,
+    teacher: &FakeTeacher,
+    order: &SlotOrder,
+    episodes: &mut [Episode],
+) {
     for (ordered, episode) in order.episodes.iter().zip(episodes) {
         if !ordered.advised {
             continue;
         }
         let charged = loop {
-            let charged = teacher.books().charge("toy", ordered.number, u64::from(UNITS));
+            let charged = teacher.books().charge(account, ordered.number, u64::from(UNITS));
             match charged {
                 Some(charged) => break charged,
                 None => tokio::time::sleep(Duration::from_millis(10)).await,
@@ -264,6 +274,42 @@ async fn a_resumed_run_finds_its_account_in_every_state_of_the_ledger() {
         again.join("toy").await;
         again.shutdown.cancel();
         again.end().await.expect("resumed");
+        assert_eq!(teacher.books().opened, expected);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_keeps_the_account_that_it_opened_after_a_loss_of_charges() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    let mut run = advised(0, AMPLE);
+    let whole = run.stop.max_env_steps;
+    run.stop.max_env_steps = whole / 2;
+    let served = Served::start(with_teacher(run.clone(), directory.path(), false, address)).await;
+    let mut toy = served.join("toy").await;
+    while play_one(&mut toy, &teacher).await {}
+    served.end().await.expect("the first half");
+    if let Some(account) = teacher.books().accounts.get_mut("toy") {
+        account.spent = 0;
+    }
+    let spent = 20 * u64::from(UNITS);
+    let renamed = format!("toy.from-{spent}");
+    let expected = [("toy".to_owned(), AMPLE), (renamed.clone(), AMPLE - spent)];
+    run.stop.max_env_steps = whole;
+    // Each resumed part plays more than a round, so it ends with other charges than it began with.
+    for _ in 0..2 {
+        let config = with_teacher(run.clone(), directory.path(), true, address);
+        let served = Served::start(config).await;
+        let mut toy = served.join("toy").await;
+        for _ in 0..6 {
+            let (order, mut episodes) = toy.take().await.expect("a slot");
+            charge_to(&renamed, &teacher, &order, &mut episodes).await;
+            toy.deliver(order.slot, &episodes).await.expect("taken");
+        }
+        assert_eq!(warning(&mut toy).await, "");
+        served.shutdown.cancel();
+        served.end().await.expect("interrupted");
         assert_eq!(teacher.books().opened, expected);
     }
 }

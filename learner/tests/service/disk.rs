@@ -143,10 +143,9 @@ async fn a_disk_that_stays_full_ends_the_run_with_an_error_and_it_can_be_resumed
     disk.fill();
     while toy.play_one().await {}
     let error = served.end().await.expect_err("not everything is written");
-    let Error::RunDirectory { source, .. } = &error else { panic!("{error}") };
-    let warning_text = source.to_string();
+    let Error::Unwritten { trouble, .. } = &error else { panic!("{error}") };
     for what in ["the checkpoint of round 9", "No space left on device"] {
-        assert!(warning_text.contains(what), "{warning_text}");
+        assert!(trouble.contains(what), "{trouble}");
     }
     disk.make_room();
     let again = Served::start(learner_config(config(0), &out, true)).await;

@@ -110,6 +110,24 @@ async fn a_claim_that_the_teachers_account_contradicts_is_reported_and_the_accou
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn false_claims_are_reported_next_to_an_account_that_was_used_before() {
+    let teacher = FakeTeacher::default();
+    let address = teacher.serve().await;
+    let first = tempfile::tempdir().expect("a directory");
+    let config = with_teacher(advised(0, BUDGET), first.path(), false, address);
+    run_with_false_claims(config, &teacher, true, |_| ()).await;
+    let second = tempfile::tempdir().expect("a directory");
+    let config = with_teacher(advised(0, BUDGET), second.path(), false, address);
+    let all_advised: FalseClaim = |episode| claim(episode, 50);
+    let (_, warnings) = run_with_false_claims(config, &teacher, false, all_advised).await;
+    let last = warnings.last().expect("warnings");
+    assert!(last.starts_with("the teacher's account \"toy\" was used before, "), "{last}");
+    // The earlier run was charged 252 units, which the episodes of round 0 may claim.
+    let claims = "; the episodes of round 1 claim 200 units of advice, the teacher's account \"toy\" was charged 52";
+    assert!(last.contains(claims), "{last}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_run_resumed_after_false_claims_continues_with_its_account() {
     let directory = tempfile::tempdir().expect("a directory");
     let (out, teacher) = (directory.path(), FakeTeacher::default());

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use tandem_core::Episode;
 use tandem_learner::{LingerPolicy, ServeOptions, serve_with};
 use tandem_proto::{encode_episode, pb};
 use tandem_telemetry::RunView;
@@ -73,22 +74,12 @@ async fn failures_of_environments_are_counted_and_warned_of_once() {
     let directory = tempfile::tempdir().expect("a directory");
     let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
     let mut toy = served.join("toy").await;
-    let first = "the environments fail repeatedly, their episodes are played again; one failure, of the server \
+    let first = "the environments fail repeatedly, their episodes are played again: one failure, of the server \
                  http://x:1 (fake): boom 1";
     for (failures, total, warning) in [(2, 2, ""), (1, 3, first), (5, 8, first)] {
         let (order, episodes) = toy.take().await.expect("a slot");
-        let check = pb::EnvironmentCheck {
-            failures,
-            failure: format!("http://x:1 (fake): boom {failures}"),
-            ..Default::default()
-        };
-        let request = pb::SubmitEpisodesRequest {
-            worker_id: toy.id,
-            slot: order.slot,
-            episodes: episodes.iter().map(encode_episode).collect(),
-            environment_check: Some(check),
-        };
-        toy.client.submit_episodes(request).await.expect("taken");
+        let (sender, slot) = (toy.id, order.slot);
+        deliver_with_failures(&mut toy, sender, slot, &episodes, failures).await;
         let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
         let progress = progress.into_inner();
         assert_eq!((progress.environment_failures, progress.warning.as_str()), (total, warning));
@@ -96,6 +87,67 @@ async fn failures_of_environments_are_counted_and_warned_of_once() {
     }
     while toy.play_one().await {}
     served.end().await.expect("the run ends");
+}
+
+/// Delivers a slot in the name of the worker `sender`, with a report of failures of its environments.
+async fn deliver_with_failures(
+    toy: &mut Toy,
+    sender: u64,
+    slot: u64,
+    episodes: &[Episode],
+    failures: u32,
+) {
+    let check = pb::EnvironmentCheck {
+        failures,
+        failure: format!("http://x:1 (fake): boom {failures}"),
+        ..Default::default()
+    };
+    let request = pb::SubmitEpisodesRequest {
+        worker_id: sender,
+        slot,
+        episodes: episodes.iter().map(encode_episode).collect(),
+        environment_check: Some(check),
+    };
+    toy.client.submit_episodes(request).await.expect("taken");
+}
+
+#[tokio::test]
+async fn a_run_without_workers_shows_that_it_waits_for_episodes() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
+    let mut client = served.client().await;
+    let collects = async {
+        loop {
+            let progress = client.status(pb::StatusRequest {}).await.expect("it lives");
+            if progress.into_inner().phase == "collecting" {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(DEADLINE, collects).await.expect("it collects in time");
+    served.shutdown.cancel();
+    served.end().await.expect("interrupted");
+}
+
+#[tokio::test]
+async fn failures_count_once_even_if_another_worker_has_delivered_the_slot() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let served = Served::start(learner_config(toy::config(0), directory.path(), false)).await;
+    let (mut toy, other) = (served.join("toy").await, served.join("other").await);
+    let (order, episodes) = toy.take().await.expect("a slot");
+    for (sender, failures, total) in [
+        (toy.id, 1, 1),
+        (toy.id, 1, 1), // The response was lost, and the call is repeated.
+        (other.id, 4, 5),
+        (other.id, 4, 5),
+    ] {
+        deliver_with_failures(&mut toy, sender, order.slot, &episodes, failures).await;
+        let progress = toy.client.status(pb::StatusRequest {}).await.expect("it lives");
+        assert_eq!(progress.into_inner().environment_failures, total);
+    }
+    served.shutdown.cancel();
+    served.end().await.expect("interrupted");
 }
 
 #[tokio::test]

@@ -76,6 +76,38 @@ async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     assert_eq!(Left::behind(&ended, directory.path()), expected);
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_disconnects_again_loses_its_slot_at_once_again() {
+    let expected = calm(config(0)).await;
+    let directory = tempfile::tempdir().expect("a directory");
+    // The clock does not advance before the end, so no worker is slow or silent.
+    let seconds = Arc::new(AtomicU64::new(0));
+    let clock = clock_of(&seconds);
+    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
+    let served = Served::start(config).await;
+    let (mut cut, mut alive) = (served.join("cut").await, served.join("alive").await);
+    let (lost, _) = cut.take().await.expect("a slot");
+    cut.client = served.client().await;
+    // The other worker gets the slot once the learner has noticed the end of the first connection.
+    let plays_the_lost_slot = async {
+        loop {
+            let (order, episodes) = alive.take().await.expect("a slot");
+            alive.deliver(order.slot, &episodes).await.expect("taken");
+            if order.slot == lost.slot {
+                break;
+            }
+        }
+    };
+    tokio::time::timeout(DEADLINE, plays_the_lost_slot).await.expect("in time");
+    cut.take().await.expect("a slot, over the second connection");
+    drop(cut);
+    let played = async { while alive.play_one().await {} };
+    tokio::time::timeout(DEADLINE, played).await.expect("every slot is to be had");
+    seconds.store(15, Ordering::Relaxed);
+    let ended = served.end().await.expect("a run");
+    assert_eq!(Left::behind(&ended, directory.path()), expected);
+}
+
 /// Returns a clock that shows `seconds`.
 pub(crate) fn clock_of(seconds: &Arc<AtomicU64>) -> Clock {
     let seconds = seconds.clone();

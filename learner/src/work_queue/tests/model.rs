@@ -78,9 +78,9 @@ struct Model {
 }
 
 impl Model {
-    fn next(&mut self, worker: u64) -> Result<Option<u64>, SubmitError> {
+    fn next(&mut self, worker: u64) -> Result<Option<u64>, QueueError> {
         let now = self.now;
-        let member = self.members.get_mut(&worker).ok_or(SubmitError::UnknownWorker(worker))?;
+        let member = self.members.get_mut(&worker).ok_or(QueueError::UnknownWorker(worker))?;
         (member.last_seen, member.silent, member.has_asked) = (now, false, true);
         let is_own = |slot: &u64| self.slots[slot].place.is_with(worker);
         if let Some(own) = member.given.filter(is_own) {
@@ -94,8 +94,8 @@ impl Model {
             Place::Out { since, .. } => Some((since, slot.order.slot)),
             _ => None,
         });
-        let cover_after = (2 * self.took.unwrap_or_default()).clamp(COVER_AFTER, SILENT_AFTER);
-        let overdue = out.min().filter(|(since, _)| now - *since >= cover_after);
+        let backup_after = (2 * self.took.unwrap_or_default()).clamp(BACKUP_AFTER, SILENT_AFTER);
+        let overdue = out.min().filter(|(since, _)| now - *since >= backup_after);
         let chosen = queued.map(|slot| slot.order.slot).or(overdue.map(|(_, slot)| slot));
         member.given = chosen;
         if let Some(slot) = chosen.and_then(|slot| self.slots.get_mut(&slot)) {
@@ -272,7 +272,7 @@ fn every_episode_is_taken_once_and_in_order() {
         life.iter().for_each(|happening| both.happens(happening));
         let last = both.join();
         while both.model.slots.values().any(|slot| slot.place.is_open()) {
-            both.model.now += COVER_AFTER;
+            both.model.now += BACKUP_AFTER;
             if let Some(slot) = both.ask(last) {
                 both.deliver(last, slot);
             }

@@ -11,7 +11,7 @@ fn a_slot_that_takes_longer_than_its_worker_is_remembered_counts_once() {
         queue.reclaim(FORGET_AFTER);
         assert_eq!(queue.workers.len(), 0);
         let now = FORGET_AFTER + at(1);
-        assert_eq!(queue.next(slow, now), Err(SubmitError::UnknownWorker(slow)));
+        assert_eq!(queue.next(slow, now), Err(QueueError::UnknownWorker(slow)));
         let third = join(&mut queue, now);
         if someone_else_plays_it {
             assert_eq!(next_slot(&mut queue, third, now), Some(0));
