@@ -17,6 +17,10 @@ use crate::world::World;
 
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
+/// Half edge up to which cubes are clear of the hands in all drawn starts, metres.
+const CLEAR_OBJECT_HALF_M: f32 = 0.036;
+/// Smallest gap between a hand and a larger cube at the start of an episode, metres.
+const START_HAND_GAP_M: f32 = 0.002;
 
 /// One of the environments: push or pick and place, with one arm or two, in the classic or the shared world, or two
 /// arms that carry a bar in the slow world.
@@ -97,7 +101,7 @@ impl Env {
         loop {
             let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
             self.place(&arms);
-            if self.world.link_gap_m() >= START_LINK_GAP_M {
+            if self.world.link_gap_m() >= START_LINK_GAP_M && self.has_clear_hands(&arms) {
                 return;
             }
         }
@@ -237,6 +241,20 @@ impl Env {
         }
         self.world.reset_link_avoidance();
         self.world.hold();
+    }
+
+    /// Returns true if no hand is at a cube that it does not hold. For cubes of the sizes in training, this follows
+    /// from the distances in drawn starts; a hand that tilts can reach larger ones.
+    fn has_clear_hands(&self, starts: &[ArmStart]) -> bool {
+        if self.object_half_m <= CLEAR_OBJECT_HALF_M || self.world.has_bar {
+            return true;
+        }
+        self.layout.arms().zip(starts).all(|(arm, start)| {
+            self.layout.arms().all(|owner| {
+                let is_held = start.holds_object && owner == arm;
+                is_held || self.world.hand_to_object_m(arm, owner) >= START_HAND_GAP_M
+            })
+        })
     }
 
     fn commands(&self, action: &[f32]) -> Result<[Command; MAX_ARMS], SimError> {

@@ -199,6 +199,13 @@ impl World {
         self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
     }
 
+    /// Returns the smallest distance between the hand of `arm` and the object of `owner`, metres; 0 if they touch.
+    pub(crate) fn hand_to_object_m(&self, arm: ArmIndex, owner: ArmIndex) -> f32 {
+        let object = self.object_handle(owner);
+        let gaps_m = self.arms[arm.0].hand.bodies().map(|body| self.physics.gap_m(body, object));
+        gaps_m.fold(f32::INFINITY, f32::min)
+    }
+
     /// Returns the number of physics steps of the last control step in which link avoidance changed the velocity of an
     /// arm.
     pub(crate) fn n_avoiding_substeps(&self) -> u32 {
