@@ -5,7 +5,7 @@ use std::fmt;
 use tandem_core::work::{RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, TaskSpec};
 
-use crate::ports::{Environment, EnvironmentError};
+use crate::ports::{EnvironmentError, VectorEnv};
 use crate::rollout::episode_starts;
 
 /// Of so many training episodes one is played twice.
@@ -64,7 +64,7 @@ pub fn is_checked(order: &SlotOrder) -> bool {
 /// # Errors
 /// When the environments can no longer be used.
 pub fn check(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     episodes: &[Episode],
@@ -75,7 +75,7 @@ pub fn check(
 }
 
 fn replay(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     episodes: &[Episode],

@@ -8,7 +8,6 @@ use tandem_proto::environment::{
     ResetReply, StepReply, decode_environment, decode_reset_reply, decode_step_reply, encode_reset,
     encode_step,
 };
-use tandem_proto::pb::environment_client::EnvironmentClient;
 use tandem_proto::{DecodeError, pb};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -26,6 +25,8 @@ const STREAM_CAPACITY: usize = 1;
 const MAX_NAME_CHARS: usize = 100;
 /// The largest number of characters of the cause of a failure in reports.
 const MAX_CAUSE_CHARS: usize = 200;
+
+type Rpc = pb::environment_client::EnvironmentClient<AuthChannel>;
 
 /// A server of environments and its task.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,7 +67,7 @@ impl ServedTask {
 /// # Errors
 /// When the server cannot be started, does not answer after several attempts, or has an invalid task.
 pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTask, Error> {
-    let mut environments = Environments::new(config);
+    let mut environments = EnvironmentClient::new(config);
     loop {
         match environments.connect().await {
             Ok(server) => return Ok(server.served.clone()),
@@ -75,12 +76,12 @@ pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTa
     }
 }
 
-/// The server of a worker's environments, called over one stream.
+/// The client of the server of a worker's environments, called over one stream.
 ///
 /// A call that fails ends the slot; the caller [recovers](Self::recover) and plays the slot again from its start, which
 /// gives the same episodes.
 #[derive(Debug)]
-pub(crate) struct Environments {
+pub(crate) struct EnvironmentClient {
     config: EnvironmentConfig,
     retrier: Retrier,
     /// Failures since a slot was played.
@@ -100,7 +101,7 @@ pub(crate) struct Environments {
 
 #[derive(Debug)]
 struct Server {
-    client: EnvironmentClient<AuthChannel>,
+    client: Rpc,
     served: ServedTask,
 }
 
@@ -120,7 +121,7 @@ pub(crate) enum Failure {
     Final(Box<Error>),
 }
 
-impl Environments {
+impl EnvironmentClient {
     /// Creates a client, which connects on its first call.
     pub(crate) fn new(config: EnvironmentConfig) -> Self {
         Self {
@@ -281,7 +282,7 @@ impl Environments {
         let channel = self.config.client.channel(&address).map_err(|source| {
             Failure::Final(Box::new(Error::Address { role: "environment server", source }))
         })?;
-        let mut client = EnvironmentClient::new(channel)
+        let mut client = Rpc::new(channel)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let describe = client.describe(pb::DescribeEnvironmentRequest {});

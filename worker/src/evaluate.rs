@@ -11,7 +11,7 @@ use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
 use tandem_sim::{Env, WorldConfig};
 
-use crate::ports::{Act, Environment, NoAdvisor, Simulator};
+use crate::ports::{Act, NoAdvisor, Simulator, VectorEnv};
 use crate::rollout::{RolloutError, play_slot};
 
 pub use served::evaluate_served;
@@ -80,7 +80,7 @@ impl Evaluation<'_> {
     }
 
     /// Plays the episodes in copies of `env`.
-    fn run_in<E: Environment + Clone + Sync, A: Act>(
+    fn run_in<E: VectorEnv + Clone + Sync, A: Act>(
         &self,
         env: &E,
         make_actor: impl Fn(u64) -> A + Sync,
@@ -109,7 +109,7 @@ impl Evaluation<'_> {
 }
 
 fn play_alone(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     actor: &mut impl Act,
     terms: &RunTerms,
     seed: u64,

@@ -12,7 +12,7 @@ use tokio::sync::{mpsc, oneshot};
 use crate::determinism::{self, DeterminismCheck};
 use crate::error::Error;
 use crate::metrics::{Measured, WorkerMetrics};
-use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
+use crate::ports::{Advisor, AdvisorGone, EnvironmentError, Simulator, VectorEnv};
 use crate::record::metadata_of;
 use crate::recorder::{Recorder, Recording};
 use crate::rollout::{RolloutError, Tracing, play_traced_slot};
@@ -247,7 +247,7 @@ impl Advisor for PeerChannel {
     }
 }
 
-impl Environment for PeerChannel {
+impl VectorEnv for PeerChannel {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],

@@ -54,7 +54,7 @@ impl Advisor for NoAdvisor {
 }
 
 /// Environments in which the episodes of a slot are played in lock step, one episode in each; n is their number.
-pub trait Environment {
+pub trait VectorEnv {
     /// Starts the episodes of `starts`, each independent of all others, and writes the first observations, shape
     /// `[n, n_observation]`, and the goals, shape `[n, n_goal]`.
     ///
@@ -122,7 +122,7 @@ impl Simulator {
     }
 }
 
-impl Environment for Simulator {
+impl VectorEnv for Simulator {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],

@@ -10,7 +10,7 @@ use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
-use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
+use crate::ports::{Act, Advisor, AdvisorGone, EnvironmentError, VectorEnv};
 use crate::trace::{Trace, TracedAdvice};
 
 /// An error that ends a slot.
@@ -79,7 +79,7 @@ pub enum Tracing {
 /// # Errors
 /// When the advisor is gone or answers in the wrong shape, or a step of the environment fails.
 pub fn play_slot(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
@@ -95,7 +95,7 @@ pub fn play_slot(
 /// # Errors
 /// As [`play_slot`].
 pub fn play_traced_slot(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
@@ -123,7 +123,7 @@ pub fn play_traced_slot(
 }
 
 /// Adds the scenes of this moment to the traces.
-fn trace_scenes(rollouts: &mut [Rollout], env: &impl Environment) {
+fn trace_scenes(rollouts: &mut [Rollout], env: &impl VectorEnv) {
     for (environment, rollout) in rollouts.iter_mut().enumerate() {
         if let Some(trace) = &mut rollout.trace {
             trace.scenes.extend(env.scene(environment));
@@ -138,13 +138,13 @@ pub fn episode_starts(order: &SlotOrder, terms: &RunTerms) -> Vec<EpisodeStart> 
         number: episode.number,
         seed: episode.seed,
         kind: order.kind,
-        world: world_of(episode, order.kind, terms),
+        world: world_settings(episode, order.kind, terms),
     };
     order.episodes.iter().map(start).collect()
 }
 
-/// Returns the world of an episode. It depends on how far the run had come when the episode was ordered.
-pub(crate) fn world_of(
+/// Returns the settings of an episode's world. They depend on how far the run had come when the episode was ordered.
+pub(crate) fn world_settings(
     episode: &EpisodeOrder,
     kind: EpisodeKind,
     terms: &RunTerms,
@@ -155,7 +155,7 @@ pub(crate) fn world_of(
 
 /// Starts the episodes of `order`.
 fn start(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
 ) -> Result<Vec<Rollout>, RolloutError> {
@@ -195,7 +195,7 @@ impl StepBatch {
         &mut self,
         rollouts: &mut [Rollout],
         step_idx: usize,
-        env: &mut impl Environment,
+        env: &mut impl VectorEnv,
     ) -> Result<(), RolloutError> {
         let Self { layout, actions, observations, contacts } = self;
         for (rollout, action) in rollouts.iter().zip(actions.chunks_exact_mut(layout.n_action())) {

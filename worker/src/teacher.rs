@@ -3,7 +3,6 @@
 use tandem_core::{StepQuery, TaskSpec};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, TraceContext, within};
 use tandem_proto::pb;
-use tandem_proto::pb::teacher_client::TeacherClient;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
@@ -16,10 +15,12 @@ const ADVISE: Operation = Operation { peer: "teacher", purpose: "ask the teacher
 /// The capacity of an advice stream, in requests. One request is open at a time, so the worker never waits for room.
 const STREAM_CAPACITY: usize = 1;
 
-/// The teacher of a run, asked over one stream. Requests are repeated until the teacher answers.
+type Rpc = pb::teacher_client::TeacherClient<AuthChannel>;
+
+/// The client of a run's teacher, which is asked over one stream. Requests are repeated until the teacher answers.
 #[derive(Debug)]
-pub(crate) struct Teacher {
-    client: TeacherClient<AuthChannel>,
+pub(crate) struct TeacherClient {
+    client: Rpc,
     timeouts: Timeouts,
     stream: Option<AdviceStream>,
 }
@@ -30,13 +31,13 @@ struct AdviceStream {
     responses: Streaming<pb::AdviseResponse>,
 }
 
-impl Teacher {
+impl TeacherClient {
     /// Creates a client, which connects on its first call; `None` if the configuration names no teacher.
     pub(crate) fn new(config: &WorkerConfig, timeouts: Timeouts) -> Result<Option<Self>, Error> {
         let Some(address) = &config.teacher else { return Ok(None) };
         let channel = config.client.channel(address);
         let channel = channel.map_err(|source| Error::Address { role: "teacher", source })?;
-        let client = TeacherClient::new(channel)
+        let client = Rpc::new(channel)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(Some(Self { client, timeouts, stream: None }))
