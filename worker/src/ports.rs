@@ -179,17 +179,19 @@ impl VectorEnv for Simulator {
 
 impl Act for BlindActor {
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
-        self.act(observations, goals, actions);
+        // The inherent method, which takes precedence over that of the trait.
+        Self::act(self, observations, goals, actions);
     }
 }
 
 impl Act for Actor {
+    // Both call the inherent methods, which take precedence over those of the trait.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
-        self.act(observations, goals, actions);
+        Self::act(self, observations, goals, actions);
     }
 
     fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
-        self.asks(observation, goal, action)
+        Self::asks(self, observation, goal, action)
     }
 }
 
