@@ -88,7 +88,8 @@ pub(crate) struct EnvironmentClient {
     n_failures: u32,
     /// Failures that were not reported yet.
     unreported: Failures,
-    /// The name of the latest server in messages: its address and program.
+    /// The name of the latest server in messages: its address and, once it is connected, its program; empty before the
+    /// first attempt to connect.
     name: String,
     was_connected: bool,
     server: Option<Server>,
@@ -129,7 +130,7 @@ impl EnvironmentClient {
             retrier: Retrier::new(EnvironmentConfig::BACKOFF, PLAY),
             n_failures: 0,
             unreported: Failures::default(),
-            name: "of the worker".to_owned(),
+            name: String::new(),
             was_connected: false,
             server: None,
             stream: None,
@@ -152,7 +153,7 @@ impl EnvironmentClient {
         }
     }
 
-    /// Answers a request of a rollout. Returns whether the rollout still waits for the response.
+    /// Answers a request of a rollout. Returns true if the rollout still waits for the response.
     pub(crate) async fn answer(
         &mut self,
         request: PeerRequest,

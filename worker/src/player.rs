@@ -87,7 +87,7 @@ impl Player {
         &self.terms
     }
 
-    /// Returns whether the loaded actor is the one that plays `order`.
+    /// Returns true if the loaded actor is the one that plays `order`.
     pub(crate) fn has_actor_of(&self, order: &SlotOrder) -> bool {
         let has_version =
             self.actor.as_ref().is_some_and(|actor| actor.version() == order.parameter_version);
@@ -153,8 +153,8 @@ impl Player {
         Ok(PlayedSlot { episodes, check, failures: Failures::default() })
     }
 
-    /// Returns whether episodes of `kind` are traced: training episodes that are recorded. Evaluations are simulated
-    /// again.
+    /// Returns the tracing of episodes of `kind`: on for training episodes that are recorded. Evaluation episodes are
+    /// simulated again instead.
     fn tracing(&self, kind: EpisodeKind) -> Tracing {
         let records_training = self.recorder.as_ref().is_some_and(Recorder::records_training);
         match kind {

@@ -56,7 +56,7 @@ impl Recorder {
         Ok(Self { queue, episodes: config.episodes, left_out_logged: Arc::default() })
     }
 
-    /// Returns whether training episodes are recorded.
+    /// Returns true if training episodes are recorded.
     pub(crate) fn records_training(&self) -> bool {
         self.episodes == RecordedEpisodes::All
     }

@@ -61,7 +61,7 @@ pub enum RolloutError {
     },
 }
 
-/// Whether the traces of episodes are taken.
+/// Selects the results of a slot: its episodes alone, or with their traces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tracing {
     /// The episodes alone.

@@ -333,7 +333,7 @@ impl Worker {
         teacher.advise(account, task, queries, call).instrument(span).await
     }
 
-    /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
+    /// Forwards a request to the server of the environments. Returns true if the player still waits for the response.
     async fn forward(&mut self, request: PeerRequest, task: &TaskSpec) -> Result<bool, Failure> {
         let no_server = || Failure::Final(Box::new(Error::NoServer));
         self.environments.as_mut().ok_or_else(no_server)?.answer(request, task).await
