@@ -9,6 +9,7 @@ use crate::arm::{Arm, Command};
 use crate::bar;
 use crate::config::{SimError, WorldConfig};
 use crate::frame::{ArmFrame, MAX_ARMS};
+use crate::hand::Finger;
 use crate::link_avoidance::VelocityDamper;
 use crate::parameters::WorldParameters;
 use crate::physics::{Part, Physics, collides, owner};
@@ -311,11 +312,10 @@ impl World {
         let bar = self.physics.bodies[self.objects[0]].colliders();
         for (arm, gripping) in self.arms.iter().zip(&mut self.gripping) {
             let presses = |side: f32| {
-                let pads = arm.hand.fingers.iter().filter(|finger| finger.side == side);
-                let pads: Vec<ColliderHandle> = pads.map(|finger| finger.pad).collect();
-                let touches =
-                    |pad| bar.iter().any(|part| self.physics.presses(pad, *part, GRIPPING_N));
-                pads.into_iter().any(touches)
+                let mut pads = arm.hand.fingers.iter().filter(|finger| finger.side == side);
+                pads.any(|Finger { pad, .. }| {
+                    bar.iter().any(|part| self.physics.presses(*pad, *part, GRIPPING_N))
+                })
             };
             *gripping = *gripping || (presses(1.0) && presses(-1.0));
         }
