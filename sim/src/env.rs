@@ -10,10 +10,10 @@ use crate::config::{SimError, WorldConfig};
 use crate::description::{WorldDescription, describe};
 use crate::frame::MAX_ARMS;
 use crate::observation::observe_arm;
-use crate::randomization::{Episode, ObservationNoise};
+use crate::randomization::{DomainRandomization, ObservationNoise};
 use crate::scene::scene;
 use crate::start::{ArmStart, goal_area, sample_starts};
-use crate::world::World;
+use crate::world::PhysicsWorld;
 
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
@@ -36,8 +36,8 @@ pub struct Env {
     layout: Layout,
     config: WorldConfig,
     /// A world that is never stepped: the state of rapier's caches after a step would affect the next episode.
-    prototype: World,
-    world: World,
+    prototype: PhysicsWorld,
+    world: PhysicsWorld,
     /// Shape `[n_goal]`, arm frames, metres.
     goal: Vec<f32>,
     n_steps: u32,
@@ -60,7 +60,7 @@ impl Env {
             return Err(SimError::TooFewArms { task, got, expected });
         }
         let config = config.clone().checked()?;
-        let prototype = World::build(layout, &config);
+        let prototype = PhysicsWorld::build(layout, &config);
         Ok(Self {
             layout,
             world: prototype.clone(),
@@ -92,11 +92,11 @@ impl Env {
         self.object_half_m = self.config.object_half_size_m;
         self.noise = None;
         if settings.randomization > 0.0 {
-            let episode =
-                Episode::draw(rng, self.layout.task, &self.config, settings.randomization);
-            self.world.vary(&episode);
-            self.object_half_m = episode.object_half_m;
-            self.noise = Some(ObservationNoise::draw(rng, settings.randomization));
+            let (task, strength) = (self.layout.task, settings.randomization);
+            let drawn = DomainRandomization::draw(rng, task, &self.config, strength);
+            self.world.vary(&drawn);
+            self.object_half_m = drawn.object_half_m;
+            self.noise = Some(ObservationNoise::draw(rng, strength));
         }
         loop {
             let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
