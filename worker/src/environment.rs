@@ -9,18 +9,15 @@ use tandem_proto::environment::{
     encode_step,
 };
 use tandem_proto::{DecodeError, pb};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Status};
 
 use crate::config::EnvironmentConfig;
 use crate::error::Error;
 use crate::player::{Failures, PeerRequest};
+use crate::request_stream::RequestStream;
 
 const PLAY: Operation =
     Operation { peer: "environment server", purpose: "play in the environments of the server" };
-/// The capacity of a stream, in requests. One request is open at a time, so the worker never waits for room.
-const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
 /// The largest number of characters of the cause of a failure in reports.
@@ -106,11 +103,11 @@ struct Server {
     served: ServedTask,
 }
 
+/// A stream that steps `n` environments.
 #[derive(Debug)]
 struct PlayStream {
     n: usize,
-    requests: mpsc::Sender<pb::PlayRequest>,
-    responses: Streaming<pb::PlayResponse>,
+    stream: RequestStream<pb::PlayRequest, pb::PlayResponse>,
 }
 
 /// The failure of a call.
@@ -228,32 +225,24 @@ impl EnvironmentClient {
         Ok(())
     }
 
-    /// Sends one request and waits for its response. A stream that failed is not used again.
+    /// Sends one request and waits for its response.
     async fn exchange(
         &mut self,
         n: usize,
         request: pb::PlayRequest,
         task: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
-        let stream = self.stream.take().filter(|stream| stream.n == n);
+        let stream = self.stream.take().filter(|open| open.n == n).map(|open| open.stream);
         let reply_timeout = self.config.reply_timeout;
-        let server = self.connect().await?;
+        let Server { client, served } = self.connect().await?;
         // The server may have been replaced since the last call.
-        server.served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
-        server.served.check_room(n).map_err(|error| Failure::Final(Box::new(error)))?;
-        let exchanged = within(reply_timeout, async {
-            let mut stream = match stream {
-                Some(stream) => {
-                    stream.requests.send(request).await.map_err(|_unsent| closed())?;
-                    stream
-                }
-                None => server.open(n, request).await?,
-            };
-            let response = stream.responses.message().await?.ok_or_else(closed)?;
-            Ok((stream, response))
-        });
-        let (stream, response) = exchanged.await.map_err(|status| self.play_failure(status))?;
-        self.stream = Some(stream);
+        served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
+        served.check_room(n).map_err(|error| Failure::Final(Box::new(error)))?;
+        let exchange =
+            RequestStream::exchange(PLAY.peer, stream, request, |requests| client.play(requests));
+        let exchanged = within(reply_timeout, exchange).await;
+        let (response, stream) = exchanged.map_err(|status| self.play_failure(status))?;
+        self.stream = Some(PlayStream { n, stream });
         Ok(response)
     }
 
@@ -339,18 +328,4 @@ impl EnvironmentClient {
             step => format!("step {step} of episodes {:?}", self.episodes),
         }
     }
-}
-
-impl Server {
-    /// Opens a stream with its first request, because some servers do not answer before they have one.
-    async fn open(&mut self, n: usize, first: pb::PlayRequest) -> Result<PlayStream, Status> {
-        let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
-        requests.send(first).await.map_err(|_unsent| closed())?;
-        let responses = self.client.play(ReceiverStream::new(outgoing)).await?.into_inner();
-        Ok(PlayStream { n, requests, responses })
-    }
-}
-
-fn closed() -> Status {
-    Status::unavailable("the environment server closed the stream")
 }

@@ -23,6 +23,7 @@ pub mod ports;
 pub mod record;
 mod recorder;
 pub mod replay;
+mod request_stream;
 pub mod rollout;
 mod run;
 mod teacher;
