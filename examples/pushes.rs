@@ -15,7 +15,7 @@ use tandem_core::{ArmIndex, Episode, EpisodeOutcome, EvaluationSummary, Stream};
 use tandem_core::{WorldSettings, episode_rng};
 use tandem_policy::Policy;
 use tandem_sim::{Env, WorldConfig};
-use tandem_worker::evaluate;
+use tandem_worker::Evaluation;
 
 type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
@@ -96,7 +96,9 @@ pub(crate) fn measure(policy: &Policy, n_episodes: u64) -> Result<Pushes, AnyErr
     let layout = policy.layout.as_built_in().ok_or("the policy is not for a built-in task")?;
     let (world, n_threads) = (WorldConfig::default(), std::thread::available_parallelism());
     let n_threads = n_threads.unwrap_or(NonZeroUsize::MIN);
-    let episodes = evaluate(&actor, layout, &world, 0..n_episodes, SEED, n_threads)?;
+    let numbers = 0..n_episodes;
+    let evaluation = Evaluation { layout, world: &world, seed: SEED, numbers, n_threads };
+    let episodes = evaluation.run(|_| actor.clone())?;
     let outcomes: Vec<EpisodeOutcome> = episodes.iter().map(EpisodeOutcome::of).collect();
     let env = Env::new(layout, &world)?;
     let parts = episodes.par_iter().map(|episode| measure_episode(env.clone(), episode));

@@ -13,9 +13,7 @@ use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, Task
 use tandem_policy::{BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
-use tandem_worker::{
-    Perturbation, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
-};
+use tandem_worker::{ComposedTeachers, Evaluation, Perturbation, PerturbedActor};
 
 use crate::environment_file::server_options;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -102,16 +100,15 @@ impl EvaluatedPolicy {
     /// Plays the episodes with these numbers, whose goals are fixed by `seed`, on all cores.
     pub(crate) fn play(&self, numbers: Range<u64>, seed: u64) -> Result<Vec<Episode>, Failed> {
         let actor = self.policy().actor().or_exit(Exit::Data, String::new)?;
-        let (layout, world) = (self.layout(), WorldConfig::default());
-        let n_threads = n_threads();
+        let world = &WorldConfig::default();
+        let layout = self.layout();
+        let evaluation = Evaluation { layout, world, seed, numbers, n_threads: n_threads() };
         let episodes = match self {
-            Self::Policy(_) => evaluate(&actor, layout, &world, numbers, seed, n_threads),
-            Self::Composed(..) => {
-                evaluate_composed(&actor, layout, &world, numbers, seed, n_threads)
-            }
+            Self::Policy(_) => evaluation.run(|_| actor.clone()),
+            Self::Composed(..) => evaluation.run(|_| ComposedTeachers::new(actor.clone(), layout)),
             Self::Blind(policy) => {
                 let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
-                evaluate_blind(&blind, layout, &world, numbers, seed, n_threads)
+                evaluation.run(|_| blind.clone())
             }
         };
         episodes.or_exit(Exit::Bug, String::new)
@@ -183,15 +180,15 @@ pub(crate) fn measure(
 pub(crate) fn measure_perturbed(
     policy: &Policy,
     layout: Layout,
-    conditions: (&WorldConfig, Perturbation),
-    goals: (u64, u64),
+    (world, perturbation): (&WorldConfig, Perturbation),
+    (n_episodes, seed): (u64, u64),
     take: Take<'_>,
 ) -> Result<EvaluationResult, Failed> {
     let actor = policy.actor().or_exit(Exit::Data, String::new)?;
-    let n_threads = n_threads();
-    let outcomes = Outcomes::of_parts(goals.0, take, &mut |numbers| {
-        evaluate_perturbed(&actor, layout, conditions, numbers, goals.1, n_threads)
-            .or_exit(Exit::Bug, String::new)
+    let perturbed = |number| PerturbedActor::new(actor.clone(), layout, perturbation, seed, number);
+    let outcomes = Outcomes::of_parts(n_episodes, take, &mut |numbers| {
+        let evaluation = Evaluation { layout, world, seed, numbers, n_threads: n_threads() };
+        evaluation.run(perturbed).or_exit(Exit::Bug, String::new)
     })?;
     Ok(outcomes.result(layout.into(), policy.digest()))
 }

@@ -27,9 +27,10 @@ const FALL_M: f32 = 25.0;
 const OPENING_M: f32 = 1.0;
 /// Components of a unit quaternion.
 const UNIT: f32 = 1.01;
-/// Velocities, metres per control step: 50 m/s with the classic world's steps of 0.04 s, 8 m/s with those of 0.25 s.
+/// Velocities, metres per control step of the classic world, 0.04 s: 50 m/s. Bounds of the shared world's steps are
+/// larger by the ratio of the durations. Those of carry-bar, whose steps also last 0.25 s, are not: 8 m/s.
 const SPEED: f32 = 2.0;
-/// Angular velocities, radians per control step: 120 revolutions per second with steps of 0.04 s, 19 with those of 0.25 s.
+/// Angular velocities, radians per control step: 120 revolutions per second, in carry-bar 19.
 const SPIN: f32 = 30.0;
 
 /// The bounds of one arm's observation, in its order, for the tasks with an object on a table.

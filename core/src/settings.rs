@@ -99,9 +99,10 @@ pub struct WorldSettings {
     /// classic world, and a quarter of it in the other ones. The test at the end of a run, `tandem eval` and films use
     /// 20.
     pub substeps: u32,
-    /// Extent to which the world varies between training episodes, in [0, 1]: size, mass and friction of the objects,
-    /// delay of the actions and noise of the observations. 0 disables it, 1 uses the full ranges. Files of earlier
-    /// versions have 0.
+    /// Extent to which the world varies between training episodes, in [0, 1]: size and mass of the objects, friction of
+    /// objects, table and pads, delay of the actions, noise of the observations and, in the shared world, the gap of up
+    /// to 2 cm below which two arms count as touching. 0 disables it, 1 uses the full ranges. Files of earlier versions
+    /// have 0.
     #[serde(default)]
     pub randomization: f32,
 }

@@ -19,9 +19,9 @@ pub(crate) struct EnvironmentMetrics {
 /// The part of a request that its metrics need.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Work {
-    /// The start of so many episodes.
+    /// Resets of this many environments.
     Reset(u64),
-    /// One step of so many environments.
+    /// One step of this many environments.
     Step(u64),
 }
 

@@ -112,7 +112,7 @@ impl Session {
         Ok(encode_reset_reply(&observations, &goals))
     }
 
-    /// Returns environment `idx`, or a new one behind the last, with so many physics steps per control step.
+    /// Returns environment `idx`, creating it if it is missing or has other `substeps`.
     fn environment(&mut self, idx: usize, substeps: u32) -> Result<&mut Env, SimError> {
         let fits = self.environments.get(idx).is_some_and(|known| known.substeps == substeps);
         if !fits {

@@ -96,7 +96,7 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
 /// Reports the end of a run that has reached the limit `reason`, or was interrupted, and returns the outcome.
 fn outcome(reason: Option<String>, round: u64, digest: String) -> RunOutcome {
     let interrupted = reason.is_none();
-    let reason = reason.unwrap_or_else(|| "interrupted".to_owned());
+    let reason = reason.unwrap_or_else(|| INTERRUPTED.to_owned());
     RunFinished { reason: &reason, round, digest: &digest }.emit();
     RunOutcome { reason, interrupted, digest }
 }

@@ -125,9 +125,7 @@ impl Trainer {
     pub fn start_from(&mut self, teacher: &Policy) -> Result<(), String> {
         let (task, n_arms) = (self.layout.name(), teacher.layout.n_arms());
         let Some(one_arm) = self.layout.single_arm() else {
-            return Err(format!(
-                "{task} has numbers common to all arms, so no arm is a task of its own"
-            ));
+            return Err(format!("the arms of {task} are not instances of one task of one arm"));
         };
         if teacher.layout.name() != one_arm.name() || n_arms != 1 || teacher.n_heads != 1 {
             return Err(format!(

@@ -30,7 +30,7 @@ use crate::parameters::{ArmKind, WorldParameters};
 pub use crate::physics::Part;
 use crate::physics::{GRAVITY, owner};
 use crate::reach::Reach;
-use crate::world::World;
+use crate::world::PhysicsWorld;
 
 /// A world as data.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -239,7 +239,11 @@ pub struct LinkAvoidance {
 }
 
 /// Describes `world`, which was built for `layout` from `config`.
-pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> WorldDescription {
+pub(crate) fn describe(
+    world: &PhysicsWorld,
+    layout: Layout,
+    config: &WorldConfig,
+) -> WorldDescription {
     let kind = layout.task.world();
     WorldDescription {
         task: layout.task.name(),
@@ -259,7 +263,7 @@ pub(crate) fn describe(world: &World, layout: Layout, config: &WorldConfig) -> W
     }
 }
 
-fn bodies(world: &World) -> Vec<BodyDescription> {
+fn bodies(world: &PhysicsWorld) -> Vec<BodyDescription> {
     let describe = |(handle, body): (RigidBodyHandle, &RigidBody)| BodyDescription {
         rotates: !body.is_rotation_locked().contains(&true),
         gravity_scale: body.gravity_scale(),
@@ -269,12 +273,12 @@ fn bodies(world: &World) -> Vec<BodyDescription> {
 }
 
 /// Returns the mass of a body that belongs to none of its shapes, kilograms.
-fn own_mass_kg(world: &World, body: RigidBodyHandle) -> f32 {
+fn own_mass_kg(world: &PhysicsWorld, body: RigidBodyHandle) -> f32 {
     let hand = world.arms.iter().map(|arm| &arm.hand).find(|hand| hand.palm == body);
     hand.map_or(0.0, |hand| hand.settings.mass_at_end_effector_kg())
 }
 
-fn shapes(world: &World) -> Vec<ShapeDescription> {
+fn shapes(world: &PhysicsWorld) -> Vec<ShapeDescription> {
     let describe = |collider: &Collider| {
         let (part, arm) = owner(collider);
         let pose: Pose = match collider.position_wrt_parent() {
@@ -310,7 +314,7 @@ fn centre(shape: &SharedShape) -> Vector {
     shape.as_capsule().map_or(Vector::ZERO, |capsule| capsule.center())
 }
 
-fn contact_pairs(world: &World) -> Vec<ContactPairDescription> {
+fn contact_pairs(world: &PhysicsWorld) -> Vec<ContactPairDescription> {
     let colliders: Vec<&Collider> =
         world.physics.colliders.iter().map(|(_, collider)| collider).collect();
     let mut pairs = Vec::new();
@@ -333,7 +337,7 @@ fn contact_pairs(world: &World) -> Vec<ContactPairDescription> {
     pairs
 }
 
-fn arm_description(world: &World, idx: ArmIndex) -> ArmDescription {
+fn arm_description(world: &PhysicsWorld, idx: ArmIndex) -> ArmDescription {
     let arm = &world.arms[idx.0];
     let fingers: &[_] = match arm.hand.settings.gripper {
         Gripper::Locked => &[],
@@ -359,7 +363,7 @@ fn arm_description(world: &World, idx: ArmIndex) -> ArmDescription {
 }
 
 /// Returns the index of `body` in the order of [`bodies`].
-fn body_index(world: &World, body: RigidBodyHandle) -> usize {
+fn body_index(world: &PhysicsWorld, body: RigidBodyHandle) -> usize {
     world
         .physics
         .bodies
@@ -404,7 +408,7 @@ fn kinematics(parameters: &WorldParameters) -> Kinematics {
     }))
 }
 
-fn capsules(world: &World) -> Capsules {
+fn capsules(world: &PhysicsWorld) -> Capsules {
     if world.parameters.arms == ArmKind::Mico {
         return describe_mico_capsules(&world.arms[0].hand.settings);
     }
@@ -418,7 +422,7 @@ fn capsules(world: &World) -> Capsules {
     }
 }
 
-fn link_avoidance(world: &World) -> LinkAvoidance {
+fn link_avoidance(world: &PhysicsWorld) -> LinkAvoidance {
     LinkAvoidance {
         capsules: capsules(world),
         approach_gain_per_s: damper::APPROACH_GAIN,

@@ -10,13 +10,17 @@ use crate::config::{SimError, WorldConfig};
 use crate::description::{WorldDescription, describe};
 use crate::frame::MAX_ARMS;
 use crate::observation::observe_arm;
-use crate::randomization::{Episode, ObservationNoise};
+use crate::randomization::{DomainRandomization, ObservationNoise};
 use crate::scene::scene;
 use crate::start::{ArmStart, goal_area, sample_starts};
-use crate::world::World;
+use crate::world::PhysicsWorld;
 
 /// Smallest gap between the links of two arms at the start of an episode, metres.
 const START_LINK_GAP_M: f32 = 0.02;
+/// Half edge up to which cubes are clear of the hands in all drawn starts, metres.
+const CLEAR_OBJECT_HALF_M: f32 = 0.036;
+/// Smallest gap between a hand and a larger cube at the start of an episode, metres.
+const START_HAND_GAP_M: f32 = 0.002;
 
 /// One of the environments: push or pick and place, with one arm or two, in the classic or the shared world, or two
 /// arms that carry a bar in the slow world.
@@ -32,8 +36,8 @@ pub struct Env {
     layout: Layout,
     config: WorldConfig,
     /// A world that is never stepped: the state of rapier's caches after a step would affect the next episode.
-    prototype: World,
-    world: World,
+    prototype: PhysicsWorld,
+    world: PhysicsWorld,
     /// Shape `[n_goal]`, arm frames, metres.
     goal: Vec<f32>,
     n_steps: u32,
@@ -56,7 +60,7 @@ impl Env {
             return Err(SimError::TooFewArms { task, got, expected });
         }
         let config = config.clone().checked()?;
-        let prototype = World::build(layout, &config);
+        let prototype = PhysicsWorld::build(layout, &config);
         Ok(Self {
             layout,
             world: prototype.clone(),
@@ -88,16 +92,16 @@ impl Env {
         self.object_half_m = self.config.object_half_size_m;
         self.noise = None;
         if settings.randomization > 0.0 {
-            let episode =
-                Episode::draw(rng, self.layout.task, &self.config, settings.randomization);
-            self.world.vary(&episode);
-            self.object_half_m = episode.object_half_m;
-            self.noise = Some(ObservationNoise::draw(rng, settings.randomization));
+            let (task, strength) = (self.layout.task, settings.randomization);
+            let drawn = DomainRandomization::draw(rng, task, &self.config, strength);
+            self.world.vary(&drawn);
+            self.object_half_m = drawn.object_half_m;
+            self.noise = Some(ObservationNoise::draw(rng, strength));
         }
         loop {
             let arms = sample_starts(rng, self.layout, self.object_half_m, settings);
             self.place(&arms);
-            if self.world.link_gap_m() >= START_LINK_GAP_M {
+            if self.world.link_gap_m() >= START_LINK_GAP_M && self.has_clear_hands(&arms) {
                 return;
             }
         }
@@ -237,6 +241,20 @@ impl Env {
         }
         self.world.reset_link_avoidance();
         self.world.hold();
+    }
+
+    /// Returns true if no hand is at a cube that it does not hold. For cubes of the sizes in training, this follows
+    /// from the distances in drawn starts; a hand that tilts can reach larger ones.
+    fn has_clear_hands(&self, starts: &[ArmStart]) -> bool {
+        if self.object_half_m <= CLEAR_OBJECT_HALF_M || self.world.has_bar {
+            return true;
+        }
+        self.layout.arms().zip(starts).all(|(arm, start)| {
+            self.layout.arms().all(|owner| {
+                let is_held = start.holds_object && owner == arm;
+                is_held || self.world.hand_to_object_m(arm, owner) >= START_HAND_GAP_M
+            })
+        })
     }
 
     fn commands(&self, action: &[f32]) -> Result<[Command; MAX_ARMS], SimError> {

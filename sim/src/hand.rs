@@ -203,10 +203,15 @@ impl Hand {
         })
     }
 
+    /// Returns the bodies of the hand.
+    pub(crate) fn bodies(&self) -> impl Iterator<Item = RigidBodyHandle> {
+        let fingers = self.driven_fingers().iter().map(|finger| finger.body);
+        std::iter::once(self.palm).chain(fingers)
+    }
+
     /// Returns `true` if all positions and velocities are finite.
     pub(crate) fn is_finite(&self, physics: &Physics) -> bool {
-        let fingers = self.fingers.iter().map(|finger| finger.body);
-        std::iter::once(self.palm).chain(fingers).all(|body| {
+        self.bodies().all(|body| {
             let body = &physics.bodies[body];
             body.translation().is_finite() && body.linvel().is_finite()
         })
@@ -260,8 +265,7 @@ impl Hand {
         let orientation = upright * posture.orientation();
         let in_arm = posture.angular_velocity(self.frame.rotate(velocity));
         let angular_velocity = self.frame.rotate(in_arm);
-        let fingers = self.driven_fingers().iter().map(|finger| finger.body);
-        for handle in std::iter::once(self.palm).chain(fingers) {
+        for handle in self.bodies() {
             let body = &mut physics.bodies[handle];
             body.set_rotation(orientation, true);
             body.set_angvel(angular_velocity, true);

@@ -3,11 +3,16 @@
 use rapier3d::math::Vector;
 use tandem_core::ArmIndex;
 
-use crate::world::World;
+use crate::world::PhysicsWorld;
 
 /// Writes `arm`'s part of the observation, shape `[28]`, in the order that `Env::observe` documents. The position of the
 /// object is wrong by `error` (arm frame, metres).
-pub(crate) fn observe_arm(world: &World, arm: ArmIndex, error: Vector, observation: &mut [f32]) {
+pub(crate) fn observe_arm(
+    world: &PhysicsWorld,
+    arm: ArmIndex,
+    error: Vector,
+    observation: &mut [f32],
+) {
     let (state, object) = (&world.arms[arm.0], world.object_state(arm));
     let frame = state.frame;
     let (hand_position, hand_velocity) =
@@ -50,9 +55,10 @@ mod tests {
     /// The observations of both arms after `change` was applied to the world of `HAND` and `OBJECT` at `arm`.
     fn observed_after(
         arm: ArmIndex,
-        change: impl Fn(&mut World, ArmFrame),
+        change: impl Fn(&mut PhysicsWorld, ArmFrame),
     ) -> [[f32; OBSERVATION_PER_ARM]; 2] {
-        let mut world = World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
+        let mut world =
+            PhysicsWorld::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default());
         for arm in ARMS {
             world.place_arm(arm, HAND, 0.03);
             world.place_object(arm, OBJECT, 0.0);
@@ -67,7 +73,7 @@ mod tests {
     }
 
     /// Asserts that `change`, applied at either arm, changes the numbers in `expected` and no others.
-    fn check(change: impl Fn(&mut World, ArmIndex, ArmFrame), expected: &[(usize, f32)]) {
+    fn check(change: impl Fn(&mut PhysicsWorld, ArmIndex, ArmFrame), expected: &[(usize, f32)]) {
         for arm in ARMS {
             let before = observed_after(arm, |_, _| ());
             let after = observed_after(arm, |world, frame| change(world, arm, frame));

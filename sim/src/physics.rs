@@ -2,13 +2,15 @@
 
 use rapier3d::dynamics::{
     CCDSolver, FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager,
-    MultibodyJointSet, RigidBodySet, SoftBodySet, SpringCoefficients,
+    MultibodyJointSet, RigidBodyHandle, RigidBodySet, SoftBodySet, SpringCoefficients,
 };
 use rapier3d::geometry::{
     BroadPhaseBvh, Collider, ColliderHandle, ColliderSet, ContactPair, Group, InteractionGroups,
     InteractionTestMode, NarrowPhase,
 };
-use rapier3d::math::Vector;
+use rapier3d::math::{Pose, Vector};
+use rapier3d::parry::query;
+use rapier3d::parry::shape::Shape;
 use rapier3d::pipeline::PhysicsPipeline;
 use serde::Serialize;
 use tandem_core::{ArmIndex, Contacts, World};
@@ -160,6 +162,30 @@ impl Physics {
             }
         }
         impulses.map(|impulse| impulse / self.substep_s())
+    }
+
+    /// Returns the smallest distance between the shapes of two bodies at their present positions, metres; 0 if they
+    /// touch.
+    pub(crate) fn gap_m(&self, first: RigidBodyHandle, second: RigidBodyHandle) -> f32 {
+        let mut min_m = f32::INFINITY;
+        for (pose, shape) in self.shapes(first) {
+            for (other_pose, other_shape) in self.shapes(second) {
+                let gap = query::distance(&pose, shape, &other_pose, other_shape)
+                    .expect("parry knows the distances between boxes and capsules");
+                min_m = min_m.min(gap.distance);
+            }
+        }
+        min_m
+    }
+
+    /// Returns the shapes of a body, world frame. rapier moves colliders to their bodies only in a step.
+    fn shapes(&self, body: RigidBodyHandle) -> impl Iterator<Item = (Pose, &dyn Shape)> {
+        let body = &self.bodies[body];
+        body.colliders().iter().map(|handle| {
+            let collider = &self.colliders[*handle];
+            let in_body = collider.position_wrt_parent().copied().unwrap_or(Pose::IDENTITY);
+            (*body.position() * in_body, collider.shape())
+        })
     }
 
     /// Classifies a contact of this pair.

@@ -30,8 +30,8 @@ const PLACE_NOISE_M: f32 = 0.001;
 /// bridge demands. An arm cannot know it, so it expects the more contacts the nearer it comes to the other one.
 const CONTACT_MARGIN_M: [f32; 2] = [0.0, 0.02];
 
-/// The properties of one episode's world.
-pub(crate) struct Episode {
+/// The properties of one episode's world, drawn around those that are configured.
+pub(crate) struct DomainRandomization {
     pub(crate) object_half_m: f32,
     pub(crate) object_mass_kg: f32,
     pub(crate) surfaces: Surfaces,
@@ -44,18 +44,23 @@ pub(crate) struct Episode {
 #[derive(Clone)]
 pub(crate) struct ObservationNoise {
     rng: ChaCha8Rng,
-    share: f32,
+    strength: f32,
     /// Errors of the whole episode, arm frames, metres.
     constant: [Vector; MAX_ARMS],
     /// Errors of the current step, arm frames, metres.
     current: [Vector; MAX_ARMS],
 }
 
-impl Episode {
-    /// Draws the properties. `share` of 0 gives those of `config`, 1 the full ranges.
-    pub(crate) fn draw(rng: &mut ChaCha8Rng, task: Task, config: &WorldConfig, share: f32) -> Self {
+impl DomainRandomization {
+    /// Draws the properties. `strength` of 0 gives those of `config`, 1 the full ranges.
+    pub(crate) fn draw(
+        rng: &mut ChaCha8Rng,
+        task: Task,
+        config: &WorldConfig,
+        strength: f32,
+    ) -> Self {
         let mut between = |nominal: f32, [low, high]: [f32; 2]| {
-            nominal + share * (uniform(rng, low, high) - nominal)
+            nominal + strength * (uniform(rng, low, high) - nominal)
         };
         let nominal = config.surfaces(task);
         let object_half_m =
@@ -79,13 +84,13 @@ impl Episode {
 
 impl ObservationNoise {
     /// Draws the errors of an episode. They have a generator of their own, which `rng` seeds.
-    pub(crate) fn draw(rng: &mut ChaCha8Rng, share: f32) -> Self {
+    pub(crate) fn draw(rng: &mut ChaCha8Rng, strength: f32) -> Self {
         let mut rng = ChaCha8Rng::from_seed(rng.random());
-        let largest_m = share * PLACE_ERROR_M;
+        let largest_m = strength * PLACE_ERROR_M;
         let constant = [(); MAX_ARMS].map(|()| {
             Vector::from_array([(); 3].map(|()| uniform(&mut rng, -largest_m, largest_m)))
         });
-        let mut noise = Self { rng, share, constant, current: constant };
+        let mut noise = Self { rng, strength, constant, current: constant };
         noise.advance();
         noise
     }
@@ -94,7 +99,7 @@ impl ObservationNoise {
     pub(crate) fn advance(&mut self) {
         for (current, constant) in self.current.iter_mut().zip(self.constant) {
             let drawn = [(); 3].map(|()| standard_normal(&mut self.rng));
-            *current = constant + Vector::from_array(drawn) * (self.share * PLACE_NOISE_M);
+            *current = constant + Vector::from_array(drawn) * (self.strength * PLACE_NOISE_M);
         }
     }
 
@@ -116,26 +121,26 @@ mod tests {
             Task::ALL.into_iter().flat_map(|task| (0..500).map(move |n| (task, n)))
         {
             let mut rng = episode_rng(1, number, Stream::Reset);
-            let episode = Episode::draw(&mut rng, task, &config, 1.0);
+            let drawn = DomainRandomization::draw(&mut rng, task, &config, 1.0);
             let within = |value: f32, [low, high]: [f32; 2]| (low..=high).contains(&value);
-            assert!(within(2.0 * episode.object_half_m, OBJECT_EDGE_M));
-            assert!(within(episode.object_mass_kg, OBJECT_MASS_KG));
-            assert!(within(episode.table_friction, TABLE));
-            assert!(within(episode.delay_s, DELAY_S));
+            assert!(within(2.0 * drawn.object_half_m, OBJECT_EDGE_M));
+            assert!(within(drawn.object_mass_kg, OBJECT_MASS_KG));
+            assert!(within(drawn.table_friction, TABLE));
+            assert!(within(drawn.delay_s, DELAY_S));
             // A bar has rough handles.
             let can_drag = task.shares_object();
-            assert!(can_drag || episode.surfaces.tips < episode.table_friction);
+            assert!(can_drag || drawn.surfaces.tips < drawn.table_friction);
         }
     }
 
     #[test]
-    fn a_share_of_zero_is_the_configured_world() {
+    fn a_strength_of_zero_is_the_configured_world() {
         let config = WorldConfig::default();
         let mut rng = episode_rng(1, 0, Stream::Reset);
-        let episode = Episode::draw(&mut rng, Task::SharedPush, &config, 0.0);
-        assert_eq!(episode.object_half_m, config.object_half_size_m);
-        assert_eq!(episode.object_mass_kg, config.object_mass_kg);
-        assert_eq!(episode.surfaces, config.surfaces(Task::SharedPush));
-        assert_eq!((episode.table_friction, episode.delay_s), (config.table_friction, 0.0));
+        let drawn = DomainRandomization::draw(&mut rng, Task::SharedPush, &config, 0.0);
+        assert_eq!(drawn.object_half_m, config.object_half_size_m);
+        assert_eq!(drawn.object_mass_kg, config.object_mass_kg);
+        assert_eq!(drawn.surfaces, config.surfaces(Task::SharedPush));
+        assert_eq!((drawn.table_friction, drawn.delay_s), (config.table_friction, 0.0));
     }
 }

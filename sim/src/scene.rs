@@ -13,7 +13,7 @@ use crate::capsule::{ArmCapsules, LINK_FRAMES, LINK_RADII_M};
 use crate::frame::MAX_ARMS;
 use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
 use crate::kinematics::{ForwardKinematics, JointAngles};
-use crate::world::{TABLE_HALF_M, World};
+use crate::world::{PhysicsWorld as World, TABLE_HALF_M};
 
 /// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand
 /// position.

@@ -40,6 +40,7 @@ pub(crate) struct ArmStart {
     pub(crate) object: Vector,
     /// Rotation of the object about the vertical axis, radians.
     pub(crate) object_yaw_rad: f32,
+    pub(crate) holds_object: bool,
     pub(crate) goal: Vector,
 }
 
@@ -124,7 +125,8 @@ impl StartSampler {
                 (hand, self.object_half_m, self.grasped_object(rng, hand))
             }
         };
-        ArmStart { end_effector, opening_m, object, object_yaw_rad: 0.0, goal }
+        let holds_object = hand_start == HandStart::Grasping;
+        ArmStart { end_effector, opening_m, object, object_yaw_rad: 0.0, holds_object, goal }
     }
 
     fn point_on_table(&self, rng: &mut ChaCha8Rng) -> Vector {

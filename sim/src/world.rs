@@ -3,16 +3,17 @@
 use rapier3d::dynamics::{CoefficientCombineRule, RigidBody, RigidBodyBuilder, RigidBodyHandle};
 use rapier3d::geometry::{ColliderBuilder, ColliderHandle, SharedShape};
 use rapier3d::math::{Pose, Rotation, Vector};
-use tandem_core::{ArmIndex, Contacts, Layout};
+use tandem_core::{ArmIndex, Contacts, Layout, World};
 
 use crate::arm::{Arm, Command};
 use crate::bar;
 use crate::config::{SimError, WorldConfig};
 use crate::frame::{ArmFrame, MAX_ARMS};
+use crate::hand::Finger;
 use crate::link_avoidance::VelocityDamper;
 use crate::parameters::WorldParameters;
 use crate::physics::{Part, Physics, collides, owner};
-use crate::randomization::Episode;
+use crate::randomization::DomainRandomization;
 
 /// Half extents of the table, metres; its top is at z = 0.
 pub(crate) const TABLE_HALF_M: Vector = Vector::new(0.8, 0.6, 0.05);
@@ -34,7 +35,7 @@ pub(crate) struct ObjectState {
 
 /// The state of all bodies. There is one object per arm, in arm order, or one bar.
 #[derive(Clone)]
-pub(crate) struct World {
+pub(crate) struct PhysicsWorld {
     pub(crate) physics: Physics,
     pub(crate) arms: Vec<Arm>,
     pub(crate) objects: Vec<RigidBodyHandle>,
@@ -55,7 +56,7 @@ pub(crate) struct World {
     pub(crate) control_step_s: f32,
 }
 
-impl World {
+impl PhysicsWorld {
     /// Creates a world whose bodies have not been placed yet.
     pub(crate) fn build(layout: Layout, config: &WorldConfig) -> Self {
         let friction = config.surfaces(layout.task);
@@ -74,7 +75,7 @@ impl World {
         if layout.task.shares_object() {
             objects.push(bar::build(&mut physics, friction.object));
         }
-        if kind == tandem_core::World::Shared {
+        if kind == World::Shared {
             for arm in layout.arms() {
                 add_floor(&mut physics, arm, config.table_friction);
             }
@@ -130,22 +131,22 @@ impl World {
 
     /// Gives objects, pads and table the properties that were drawn for an episode, and delays its actions. A bar keeps
     /// its size and mass. To be called before the first step and before the arms are placed.
-    pub(crate) fn vary(&mut self, episode: &Episode) {
-        let half_m = episode.object_half_m;
+    pub(crate) fn vary(&mut self, drawn: &DomainRandomization) {
+        let half_m = drawn.object_half_m;
         for object in &self.objects {
             for collider in self.physics.bodies[*object].colliders() {
                 let part = &mut self.physics.colliders[*collider];
                 if !self.has_bar {
                     part.set_shape(SharedShape::cuboid(half_m, half_m, half_m));
-                    part.set_mass(episode.object_mass_kg);
+                    part.set_mass(drawn.object_mass_kg);
                 }
-                part.set_friction(episode.surfaces.object);
+                part.set_friction(drawn.surfaces.object);
             }
         }
         for finger in self.arms.iter().flat_map(|arm| &arm.hand.fingers) {
-            self.physics.colliders[finger.pad].set_friction(episode.surfaces.sides);
+            self.physics.colliders[finger.pad].set_friction(drawn.surfaces.sides);
             if let Some(tip) = finger.tip {
-                self.physics.colliders[tip].set_friction(episode.surfaces.tips);
+                self.physics.colliders[tip].set_friction(drawn.surfaces.tips);
             }
         }
         let tables: Vec<ColliderHandle> = self
@@ -156,16 +157,16 @@ impl World {
             .map(|(handle, _)| handle)
             .collect();
         for table in tables {
-            self.physics.colliders[table].set_friction(episode.table_friction);
+            self.physics.colliders[table].set_friction(drawn.table_friction);
         }
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
             reason = "a few steps, at least 0"
         )]
-        let delay_substeps = (episode.delay_s / self.physics.substep_s()) as u32;
+        let delay_substeps = (drawn.delay_s / self.physics.substep_s()) as u32;
         self.delay_substeps = delay_substeps;
-        self.contact_margin_m = episode.contact_margin_m;
+        self.contact_margin_m = drawn.contact_margin_m;
     }
 
     /// Makes the arms stay where they are, with grippers as they are, until the first action takes effect.
@@ -197,6 +198,13 @@ impl World {
     /// arm.
     pub(crate) fn link_gap_m(&self) -> f32 {
         self.damper.as_ref().map_or(f32::INFINITY, VelocityDamper::min_gap_m)
+    }
+
+    /// Returns the smallest distance between the hand of `arm` and the object of `owner`, metres; 0 if they touch.
+    pub(crate) fn hand_to_object_m(&self, arm: ArmIndex, owner: ArmIndex) -> f32 {
+        let object = self.object_handle(owner);
+        let gaps_m = self.arms[arm.0].hand.bodies().map(|body| self.physics.gap_m(body, object));
+        gaps_m.fold(f32::INFINITY, f32::min)
     }
 
     /// Returns the number of physics steps of the last control step in which link avoidance changed the velocity of an
@@ -304,11 +312,10 @@ impl World {
         let bar = self.physics.bodies[self.objects[0]].colliders();
         for (arm, gripping) in self.arms.iter().zip(&mut self.gripping) {
             let presses = |side: f32| {
-                let pads = arm.hand.fingers.iter().filter(|finger| finger.side == side);
-                let pads: Vec<ColliderHandle> = pads.map(|finger| finger.pad).collect();
-                let touches =
-                    |pad| bar.iter().any(|part| self.physics.presses(pad, *part, GRIPPING_N));
-                pads.into_iter().any(touches)
+                let mut pads = arm.hand.fingers.iter().filter(|finger| finger.side == side);
+                pads.any(|Finger { pad, .. }| {
+                    bar.iter().any(|part| self.physics.presses(*pad, *part, GRIPPING_N))
+                })
             };
             *gripping = *gripping || (presses(1.0) && presses(-1.0));
         }

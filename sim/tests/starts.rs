@@ -221,6 +221,28 @@ fn no_start_has_a_contact() {
     }
 }
 
+/// The hands of the shared world tilt: pads of an open gripper and the palm come lower than those of upright hands.
+#[test]
+fn hands_do_not_touch_large_cubes_at_the_start() {
+    let config = WorldConfig { object_half_size_m: 0.045, ..WorldConfig::default() };
+    for layout in layouts().filter(|layout| !layout.task.shares_object()) {
+        let mut env = Env::new(layout, &config).expect("a valid world");
+        let (mut before, mut after) =
+            (vec![0.0; layout.n_observation()], vec![0.0; layout.n_observation()]);
+        for seed in 0..300 {
+            env.reset(&mut episode_rng(seed, 0, Stream::Reset), WorldSettings::default());
+            env.observe(&mut before);
+            assert_eq!(env.step(&idle(layout, 1.0)).unwrap(), Contacts::NONE, "{layout:?}, {seed}");
+            env.observe(&mut after);
+            for arm in layout.arms() {
+                let object = layout.achieved_goal_of(arm);
+                let moved_m = distance(&before[object.clone()], &after[object]);
+                assert!(moved_m < 3e-4, "{layout:?}, {seed}: the object moved by {moved_m} m");
+            }
+        }
+    }
+}
+
 #[test]
 fn large_cubes_do_not_overlap_at_the_start() {
     let edge_m = 0.09;

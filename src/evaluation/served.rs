@@ -104,8 +104,8 @@ fn check_task(part: Part, policy: &Policy, served: &ServedTask) -> Result<(), Fa
             Some(one_arm) => (one_arm, "one arm of "),
             None => {
                 return Err(Failed::usage(format!(
-                    "the arms of task {name:?} of the environment server {server} have common numbers: a one-arm \
-                     policy cannot control them"
+                    "the arms of task {name:?} of the environment server {server} are not instances of one task of \
+                     one arm: a one-arm policy cannot control them"
                 )));
             }
         },

@@ -5,10 +5,10 @@ use std::fmt;
 use tandem_core::work::{RunTerms, SlotOrder};
 use tandem_core::{Contacts, Episode, EpisodeKind, TaskSpec};
 
-use crate::ports::{Environment, EnvironmentError};
+use crate::ports::{EnvironmentError, VectorEnv};
 use crate::rollout::episode_starts;
 
-/// Of so many training episodes one is played twice.
+/// One in this many training episodes is played twice.
 pub const CHECKED_ONE_IN: u64 = 100;
 
 /// The result of playing a slot twice.
@@ -49,7 +49,7 @@ impl fmt::Display for Difference {
     }
 }
 
-/// Returns whether the episodes of a slot are played twice.
+/// Returns true if the episodes of a slot are played twice.
 ///
 /// The choice depends on the numbers of the episodes, so it does not depend on the worker.
 #[must_use]
@@ -64,7 +64,7 @@ pub fn is_checked(order: &SlotOrder) -> bool {
 /// # Errors
 /// When the environments can no longer be used.
 pub fn check(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     episodes: &[Episode],
@@ -75,7 +75,7 @@ pub fn check(
 }
 
 fn replay(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     episodes: &[Episode],

@@ -8,24 +8,22 @@ use tandem_proto::environment::{
     ResetReply, StepReply, decode_environment, decode_reset_reply, decode_step_reply, encode_reset,
     encode_step,
 };
-use tandem_proto::pb::environment_client::EnvironmentClient;
 use tandem_proto::{DecodeError, pb};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Status};
 
 use crate::config::EnvironmentConfig;
 use crate::error::Error;
 use crate::player::{Failures, PeerRequest};
+use crate::request_stream::RequestStream;
 
 const PLAY: Operation =
     Operation { peer: "environment server", purpose: "play in the environments of the server" };
-/// The capacity of a stream, in requests. One request is open at a time, so the worker never waits for room.
-const STREAM_CAPACITY: usize = 1;
 /// The largest number of characters of a server's own name in messages.
 const MAX_NAME_CHARS: usize = 100;
 /// The largest number of characters of the cause of a failure in reports.
 const MAX_CAUSE_CHARS: usize = 200;
+
+type Rpc = pb::environment_client::EnvironmentClient<AuthChannel>;
 
 /// A server of environments and its task.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,7 +64,7 @@ impl ServedTask {
 /// # Errors
 /// When the server cannot be started, does not answer after several attempts, or has an invalid task.
 pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTask, Error> {
-    let mut environments = Environments::new(config);
+    let mut environments = EnvironmentClient::new(config);
     loop {
         match environments.connect().await {
             Ok(server) => return Ok(server.served.clone()),
@@ -75,19 +73,20 @@ pub async fn describe_environments(config: EnvironmentConfig) -> Result<ServedTa
     }
 }
 
-/// The server of a worker's environments, called over one stream.
+/// The client of the server of a worker's environments, called over one stream.
 ///
 /// A call that fails ends the slot; the caller [recovers](Self::recover) and plays the slot again from its start, which
 /// gives the same episodes.
 #[derive(Debug)]
-pub(crate) struct Environments {
+pub(crate) struct EnvironmentClient {
     config: EnvironmentConfig,
     retrier: Retrier,
     /// Failures since a slot was played.
     n_failures: u32,
     /// Failures that were not reported yet.
     unreported: Failures,
-    /// The name of the latest server in messages: its address and program.
+    /// The name of the latest server in messages: its address and, once it is connected, its program; empty before the
+    /// first attempt to connect.
     name: String,
     was_connected: bool,
     server: Option<Server>,
@@ -100,15 +99,15 @@ pub(crate) struct Environments {
 
 #[derive(Debug)]
 struct Server {
-    client: EnvironmentClient<AuthChannel>,
+    client: Rpc,
     served: ServedTask,
 }
 
+/// A stream that steps `n` environments.
 #[derive(Debug)]
 struct PlayStream {
     n: usize,
-    requests: mpsc::Sender<pb::PlayRequest>,
-    responses: Streaming<pb::PlayResponse>,
+    stream: RequestStream<pb::PlayRequest, pb::PlayResponse>,
 }
 
 /// The failure of a call.
@@ -120,7 +119,7 @@ pub(crate) enum Failure {
     Final(Box<Error>),
 }
 
-impl Environments {
+impl EnvironmentClient {
     /// Creates a client, which connects on its first call.
     pub(crate) fn new(config: EnvironmentConfig) -> Self {
         Self {
@@ -128,7 +127,7 @@ impl Environments {
             retrier: Retrier::new(EnvironmentConfig::BACKOFF, PLAY),
             n_failures: 0,
             unreported: Failures::default(),
-            name: "of the worker".to_owned(),
+            name: String::new(),
             was_connected: false,
             server: None,
             stream: None,
@@ -151,7 +150,7 @@ impl Environments {
         }
     }
 
-    /// Answers a request of a rollout. Returns whether the rollout still waits for the response.
+    /// Answers a request of a rollout. Returns true if the rollout still waits for the response.
     pub(crate) async fn answer(
         &mut self,
         request: PeerRequest,
@@ -226,32 +225,24 @@ impl Environments {
         Ok(())
     }
 
-    /// Sends one request and waits for its response. A stream that failed is not used again.
+    /// Sends one request and waits for its response.
     async fn exchange(
         &mut self,
         n: usize,
         request: pb::PlayRequest,
         task: &TaskSpec,
     ) -> Result<pb::PlayResponse, Failure> {
-        let stream = self.stream.take().filter(|stream| stream.n == n);
+        let stream = self.stream.take().filter(|open| open.n == n).map(|open| open.stream);
         let reply_timeout = self.config.reply_timeout;
-        let server = self.connect().await?;
+        let Server { client, served } = self.connect().await?;
         // The server may have been replaced since the last call.
-        server.served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
-        server.served.check_room(n).map_err(|error| Failure::Final(Box::new(error)))?;
-        let exchanged = within(reply_timeout, async {
-            let mut stream = match stream {
-                Some(stream) => {
-                    stream.requests.send(request).await.map_err(|_unsent| closed())?;
-                    stream
-                }
-                None => server.open(n, request).await?,
-            };
-            let response = stream.responses.message().await?.ok_or_else(closed)?;
-            Ok((stream, response))
-        });
-        let (stream, response) = exchanged.await.map_err(|status| self.play_failure(status))?;
-        self.stream = Some(stream);
+        served.check(task).map_err(|error| Failure::Final(Box::new(error)))?;
+        served.check_room(n).map_err(|error| Failure::Final(Box::new(error)))?;
+        let exchange =
+            RequestStream::exchange(PLAY.peer, stream, request, |requests| client.play(requests));
+        let exchanged = within(reply_timeout, exchange).await;
+        let (response, stream) = exchanged.map_err(|status| self.play_failure(status))?;
+        self.stream = Some(PlayStream { n, stream });
         Ok(response)
     }
 
@@ -281,7 +272,7 @@ impl Environments {
         let channel = self.config.client.channel(&address).map_err(|source| {
             Failure::Final(Box::new(Error::Address { role: "environment server", source }))
         })?;
-        let mut client = EnvironmentClient::new(channel)
+        let mut client = Rpc::new(channel)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let describe = client.describe(pb::DescribeEnvironmentRequest {});
@@ -337,18 +328,4 @@ impl Environments {
             step => format!("step {step} of episodes {:?}", self.episodes),
         }
     }
-}
-
-impl Server {
-    /// Opens a stream with its first request, because some servers do not answer before they have one.
-    async fn open(&mut self, n: usize, first: pb::PlayRequest) -> Result<PlayStream, Status> {
-        let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
-        requests.send(first).await.map_err(|_unsent| closed())?;
-        let responses = self.client.play(ReceiverStream::new(outgoing)).await?.into_inner();
-        Ok(PlayStream { n, requests, responses })
-    }
-}
-
-fn closed() -> Status {
-    Status::unavailable("the environment server closed the stream")
 }

@@ -9,11 +9,9 @@ use std::ops::Range;
 use tandem_core::layout::Layout;
 use tandem_core::work::{EpisodeExploration, EpisodeOrder, RunTerms, SlotOrder};
 use tandem_core::{AdviceTerms, Episode, EpisodeKind, Exploration, TaskSpec, WorldSettings};
-use tandem_policy::{Actor, BlindActor};
 use tandem_sim::{Env, WorldConfig};
 
-use crate::perturbation::{Perturbation, PerturbedActor};
-use crate::ports::{Act, Environment, NoAdvisor, Simulator};
+use crate::ports::{Act, NoAdvisor, Simulator, VectorEnv};
 use crate::rollout::{RolloutError, play_slot};
 
 pub use served::evaluate_served;
@@ -53,115 +51,65 @@ impl<A: Act> Act for ComposedTeachers<A> {
     }
 }
 
-/// Plays the episodes with these numbers, and returns them in order. `seed` determines their starts and goals.
-/// `layout` has one or two arms and is the actor's.
-///
-/// Each of `n_threads` threads has a world of its own. The result does not depend on their number.
-///
-/// # Errors
-/// When the world cannot be built or a step fails.
-pub fn evaluate(
-    actor: &Actor,
-    layout: Layout,
-    world: &WorldConfig,
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|_| actor.clone(), layout, world, numbers, seed, n_threads)
+/// An evaluation in simulated worlds of this process.
+#[derive(Debug, Clone)]
+pub struct Evaluation<'a> {
+    /// The task, with one or two arms.
+    pub layout: Layout,
+    /// The world.
+    pub world: &'a WorldConfig,
+    /// The seed of the episodes' starts and goals.
+    pub seed: u64,
+    /// The numbers of the episodes.
+    pub numbers: Range<u64>,
+    /// The number of threads, each of which has a world of its own. The result does not depend on it.
+    pub n_threads: NonZeroUsize,
 }
 
-/// Plays episodes as [`evaluate`], with the one-arm policy `actor` acting for every arm of `layout`.
-///
-/// # Errors
-/// When the world cannot be built or a step fails.
-pub fn evaluate_composed(
-    actor: &Actor,
-    layout: Layout,
-    world: &WorldConfig,
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    let composed = |_| ComposedTeachers::new(actor.clone(), layout);
-    evaluate_simulated(composed, layout, world, numbers, seed, n_threads)
-}
+impl Evaluation<'_> {
+    /// Plays every episode with an actor of its own, that of its number, and returns the episodes in order.
+    ///
+    /// # Errors
+    /// When the world cannot be built or a step fails.
+    pub fn run<A: Act>(
+        &self,
+        make_actor: impl Fn(u64) -> A + Sync,
+    ) -> Result<Vec<Episode>, RolloutError> {
+        let env = Env::new(self.layout, self.world).map_err(RolloutError::NoEnvironment)?;
+        self.run_in(&Simulator::new(env), make_actor)
+    }
 
-/// Plays episodes as [`evaluate`], with a policy whose arms do not see each other.
-///
-/// # Errors
-/// When the world cannot be built or a step fails.
-pub fn evaluate_blind(
-    actor: &BlindActor,
-    layout: Layout,
-    world: &WorldConfig,
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    evaluate_simulated(|_| actor.clone(), layout, world, numbers, seed, n_threads)
-}
-
-/// Plays episodes as [`evaluate`], with the errors of a perturbation between the policy and the arms.
-///
-/// # Errors
-/// When the world cannot be built or a step fails.
-pub fn evaluate_perturbed(
-    actor: &Actor,
-    layout: Layout,
-    (world, perturbation): (&WorldConfig, Perturbation),
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    let perturbed = |number| PerturbedActor::new(actor.clone(), layout, perturbation, seed, number);
-    evaluate_simulated(perturbed, layout, world, numbers, seed, n_threads)
-}
-
-/// Plays every episode with an actor of its own, that of its number.
-fn evaluate_simulated<A: Act>(
-    make_actor: impl Fn(u64) -> A + Sync,
-    layout: Layout,
-    world: &WorldConfig,
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    let env = Env::new(layout, world).map_err(RolloutError::NoEnvironment)?;
-    let terms = evaluation_terms(layout);
-    evaluate_in(&Simulator::new(env), make_actor, &terms, numbers, seed, n_threads)
-}
-
-fn evaluate_in<E: Environment + Clone + Sync, A: Act>(
-    env: &E,
-    make_actor: impl Fn(u64) -> A + Sync,
-    terms: &RunTerms,
-    numbers: Range<u64>,
-    seed: u64,
-    n_threads: NonZeroUsize,
-) -> Result<Vec<Episode>, RolloutError> {
-    let numbers: Vec<u64> = numbers.collect();
-    let n_per_thread = numbers.len().div_ceil(n_threads.get()).max(1);
-    let play = |numbers: &[u64]| {
-        let mut env = env.clone();
-        let play_one =
-            |number: &u64| play_alone(&mut env, &mut make_actor(*number), terms, seed, *number);
-        numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
-    };
-    let parts: Vec<_> = std::thread::scope(|scope| {
-        let threads: Vec<_> =
-            numbers.chunks(n_per_thread).map(|part| scope.spawn(|| play(part))).collect();
-        threads
-            .into_iter()
-            .map(|thread| thread.join().expect("a panicking rollout is a bug"))
-            .collect()
-    });
-    let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
-    Ok(parts.into_iter().flatten().collect())
+    /// Plays the episodes in copies of `env`.
+    fn run_in<E: VectorEnv + Clone + Sync, A: Act>(
+        &self,
+        env: &E,
+        make_actor: impl Fn(u64) -> A + Sync,
+    ) -> Result<Vec<Episode>, RolloutError> {
+        let terms = evaluation_terms(self.layout);
+        let numbers: Vec<u64> = self.numbers.clone().collect();
+        let n_per_thread = numbers.len().div_ceil(self.n_threads.get()).max(1);
+        let play = |numbers: &[u64]| {
+            let mut env = env.clone();
+            let play_one = |number: &u64| {
+                play_alone(&mut env, &mut make_actor(*number), &terms, self.seed, *number)
+            };
+            numbers.iter().map(play_one).collect::<Result<Vec<Episode>, RolloutError>>()
+        };
+        let parts: Vec<_> = std::thread::scope(|scope| {
+            let threads: Vec<_> =
+                numbers.chunks(n_per_thread).map(|part| scope.spawn(|| play(part))).collect();
+            threads
+                .into_iter()
+                .map(|thread| thread.join().expect("a panicking rollout is a bug"))
+                .collect()
+        });
+        let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
+        Ok(parts.into_iter().flatten().collect())
+    }
 }
 
 fn play_alone(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     actor: &mut impl Act,
     terms: &RunTerms,
     seed: u64,
@@ -212,15 +160,10 @@ mod tests {
 
     fn evaluate_fake(numbers: Range<u64>, seed: u64, n_threads: usize) -> Vec<Episode> {
         let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
-        evaluate_in(
-            &FakeEnvironment::new(),
-            |_| FakeActor::Seeker,
-            &evaluation_terms(LAYOUT),
-            numbers,
-            seed,
-            n_threads,
-        )
-        .expect("no step fails")
+        let world = &WorldConfig::default();
+        let evaluation = Evaluation { layout: LAYOUT, world, seed, numbers, n_threads };
+        let played = evaluation.run_in(&FakeEnvironment::new(), |_| FakeActor::Seeker);
+        played.expect("no step fails")
     }
 
     #[test]
@@ -251,9 +194,10 @@ mod tests {
     fn the_number_of_threads_changes_no_simulation() {
         let evaluate_on = |n_threads| {
             let n_threads = NonZeroUsize::new(n_threads).expect("1 or more");
-            let (make_actor, world) = (|_| FakeActor::Seeker, WorldConfig::default());
-            evaluate_simulated(make_actor, LAYOUT, &world, 0..3, 5, n_threads)
-                .expect("no step fails")
+            let world = &WorldConfig::default();
+            let evaluation =
+                Evaluation { layout: LAYOUT, world, seed: 5, numbers: 0..3, n_threads };
+            evaluation.run(|_| FakeActor::Seeker).expect("no step fails")
         };
         assert_eq!(evaluate_on(1), evaluate_on(2));
     }

@@ -66,8 +66,8 @@ impl Explorer {
         self.explore_holding(action, |_arm| false);
     }
 
-    /// As [`explore`](Self::explore), where `holds` tells which arms hold their objects: no random action opens their
-    /// grippers, because one such step drops an object.
+    /// As [`explore`](Self::explore). `holds` returns true for arms that hold an object; a random action never opens
+    /// their grippers, because one such step drops an object.
     ///
     /// # Panics
     /// If the action is too short.
@@ -106,7 +106,8 @@ fn explore_arm(
     }
 }
 
-/// Whether a random action starts if the previous one is no longer held, and for how many steps it is held.
+/// The draw that decides if a random action starts once the previous one is no longer held, and the number of steps
+/// for which it is held.
 #[derive(Debug, Clone, Copy)]
 struct HoldDraw {
     starts: bool,

@@ -9,7 +9,7 @@ use tandem_core::{
     WorldSettings,
 };
 
-use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
+use crate::ports::{Act, Advisor, AdvisorGone, EnvironmentError, VectorEnv};
 
 pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
 
@@ -43,7 +43,7 @@ impl FakeEnvironment {
     }
 }
 
-impl Environment for FakeEnvironment {
+impl VectorEnv for FakeEnvironment {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],

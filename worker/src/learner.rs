@@ -5,7 +5,6 @@ use std::time::Duration;
 use tandem_core::TaskSpec;
 use tandem_core::work::{PublishedActor, RunTerms, SlotOrder};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, TraceContext, retry};
-use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::{DecodeError, pb};
 use tonic::{Code, Request, Response, Status};
 
@@ -18,7 +17,7 @@ const NEXT_WORK: Operation = Operation { peer: "learner", purpose: "ask for work
 const FETCH: Operation = Operation { peer: "learner", purpose: "fetch parameters" };
 const SUBMIT: Operation = Operation { peer: "learner", purpose: "deliver episodes" };
 
-type Client = LearnerClient<AuthChannel>;
+type Rpc = pb::learner_client::LearnerClient<AuthChannel>;
 
 /// The learner's response to a request for work.
 #[derive(Debug)]
@@ -33,21 +32,21 @@ pub(crate) enum Work {
     Interrupted(String),
 }
 
-/// The learner of a run. Calls are repeated until the learner answers.
+/// The client of a run's learner. Calls are repeated until the learner answers.
 ///
 /// Calls return `None` if the learner does not know their subject, as after a restart.
 #[derive(Debug)]
-pub(crate) struct Learner {
-    client: Client,
+pub(crate) struct LearnerClient {
+    client: Rpc,
     timeouts: Timeouts,
 }
 
-impl Learner {
+impl LearnerClient {
     /// Creates a client, which connects on its first call.
     pub(crate) fn new(config: &WorkerConfig, timeouts: Timeouts) -> Result<Self, Error> {
         let channel = config.client.channel(&config.learner);
         let channel = channel.map_err(|source| Error::Address { role: "learner", source })?;
-        let client = LearnerClient::new(channel)
+        let client = Rpc::new(channel)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(Self { client, timeouts })
@@ -59,7 +58,7 @@ impl Learner {
             worker: name.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
-        let call = |mut client: Client, request| async move { client.join(request).await };
+        let call = |mut client: Rpc, request| async move { client.join(request).await };
         let response = self.call(JOIN, self.timeouts.call, request, call).await;
         let response = response.map_err(|status| Error::protocol(JOIN, status))?;
         let terms = required("terms", response.terms).and_then(tandem_proto::decode_run_terms);
@@ -69,7 +68,7 @@ impl Learner {
     /// Returns the next work, unless the learner does not know the worker.
     pub(crate) async fn next_work(&self, worker_id: u64) -> Result<Option<Work>, Error> {
         let request = pb::NextWorkRequest { worker_id };
-        let call = |mut client: Client, request| async move { client.next_work(request).await };
+        let call = |mut client: Rpc, request| async move { client.next_work(request).await };
         let response = self.call(NEXT_WORK, self.timeouts.work, request, call).await;
         let Some(response) = if_known(NEXT_WORK, response)? else { return Ok(None) };
         decode_work(response).map(Some).map_err(|error| Error::protocol(NEXT_WORK, error))
@@ -82,8 +81,7 @@ impl Learner {
         layout: &TaskSpec,
     ) -> Result<Option<PublishedActor>, Error> {
         let request = pb::GetParametersRequest { version };
-        let call =
-            |mut client: Client, request| async move { client.get_parameters(request).await };
+        let call = |mut client: Rpc, request| async move { client.get_parameters(request).await };
         let response = self.call(FETCH, self.timeouts.call, request, call).await;
         let Some(response) = if_known(FETCH, response)? else { return Ok(None) };
         let decode = || {
@@ -94,24 +92,24 @@ impl Learner {
         decode().map(Some).map_err(|error| Error::protocol(FETCH, error))
     }
 
-    /// Delivers the episodes of a slot within the span `trace`, unless the learner does not know the worker.
+    /// Delivers the episodes of a slot within the span `trace`. Returns false if the learner does not know the worker.
     pub(crate) async fn submit(
         &self,
         worker_id: u64,
         slot: u64,
         played: &PlayedSlot,
         trace: TraceContext,
-    ) -> Result<Option<()>, Error> {
+    ) -> Result<bool, Error> {
         let episodes = played.episodes.iter().map(tandem_proto::encode_episode).collect();
         let environment_check = environment_report(played);
         let request = pb::SubmitEpisodesRequest { worker_id, slot, episodes, environment_check };
-        let call = |mut client: Client, request| async move {
+        let call = |mut client: Rpc, request| async move {
             let mut request = Request::new(request);
             request.extensions_mut().insert(trace);
             client.submit_episodes(request).await
         };
         let response = self.call(SUBMIT, self.timeouts.call, request, call).await;
-        Ok(if_known(SUBMIT, response)?.map(drop))
+        Ok(if_known(SUBMIT, response)?.is_some())
     }
 
     /// Repeats a call until the learner answers.
@@ -120,7 +118,7 @@ impl Learner {
         operation: Operation,
         deadline: Duration,
         request: R,
-        call: impl Fn(Client, R) -> F,
+        call: impl Fn(Rpc, R) -> F,
     ) -> Result<T, Status>
     where
         F: Future<Output = Result<Response<T>, Status>>,

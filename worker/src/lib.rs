@@ -23,6 +23,7 @@ pub mod ports;
 pub mod record;
 mod recorder;
 pub mod replay;
+mod request_stream;
 pub mod rollout;
 mod run;
 mod teacher;
@@ -34,10 +35,7 @@ pub use config::{
 };
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
-pub use evaluate::{
-    ComposedTeachers, evaluate, evaluate_blind, evaluate_composed, evaluate_perturbed,
-    evaluate_served,
-};
-pub use perturbation::Perturbation;
+pub use evaluate::{ComposedTeachers, Evaluation, evaluate_served};
+pub use perturbation::{Perturbation, PerturbedActor};
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};

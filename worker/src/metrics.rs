@@ -8,7 +8,7 @@ use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_net::Metrics;
 use tandem_net::metrics::{Counter, DURATION_BUCKETS_S, Gauge, Histogram, LATENCY_BUCKETS_S};
 
-use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError};
+use crate::ports::{Advisor, AdvisorGone, EnvironmentError, VectorEnv};
 
 /// The metrics of slots.
 #[derive(Debug, Clone)]
@@ -72,7 +72,7 @@ pub(crate) struct Measured<'a, P> {
     pub(crate) metrics: &'a WorkerMetrics,
 }
 
-impl<E: Environment> Environment for Measured<'_, &mut E> {
+impl<E: VectorEnv> VectorEnv for Measured<'_, &mut E> {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],

@@ -23,7 +23,7 @@ pub struct Perturbation {
 
 /// An actor that perceives and acts with the errors of a [`Perturbation`], for one episode of a built-in task.
 #[derive(Debug, Clone)]
-pub(crate) struct PerturbedActor<A> {
+pub struct PerturbedActor<A> {
     actor: A,
     layout: Layout,
     perturbation: Perturbation,
@@ -36,7 +36,7 @@ pub(crate) struct PerturbedActor<A> {
 
 impl<A> PerturbedActor<A> {
     /// Creates the actor for episode `number` of an evaluation with `seed`, which determine the errors.
-    pub(crate) fn new(
+    pub fn new(
         actor: A,
         layout: Layout,
         perturbation: Perturbation,

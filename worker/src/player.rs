@@ -12,10 +12,10 @@ use tokio::sync::{mpsc, oneshot};
 use crate::determinism::{self, DeterminismCheck};
 use crate::error::Error;
 use crate::metrics::{Measured, WorkerMetrics};
-use crate::ports::{Advisor, AdvisorGone, Environment, EnvironmentError, Simulator};
+use crate::ports::{Advisor, AdvisorGone, EnvironmentError, Simulator, VectorEnv};
 use crate::record::metadata_of;
 use crate::recorder::{Recorder, Recording};
-use crate::rollout::{RolloutError, play_slot, play_traced_slot};
+use crate::rollout::{RolloutError, Tracing, play_traced_slot};
 use crate::trace::Trace;
 
 /// Plays slots, on a thread of its own.
@@ -87,7 +87,7 @@ impl Player {
         &self.terms
     }
 
-    /// Returns whether the loaded actor is the one that plays `order`.
+    /// Returns true if the loaded actor is the one that plays `order`.
     pub(crate) fn has_actor_of(&self, order: &SlotOrder) -> bool {
         let has_version =
             self.actor.as_ref().is_some_and(|actor| actor.version() == order.parameter_version);
@@ -124,32 +124,43 @@ impl Player {
         order: &SlotOrder,
         mut peers: PeerChannel,
     ) -> Result<PlayedSlot, RolloutError> {
+        let tracing = self.tracing(order.kind);
         let actor = self.actor.as_mut().expect("parameters are loaded before a slot is played");
-        let is_traced = order.kind == EpisodeKind::Training
-            && self.recorder.as_ref().is_some_and(Recorder::records_training);
         let (terms, metrics, start) = (&self.terms, &self.metrics, self.metrics.now());
         let advisor = &mut Measured { port: &mut peers.clone(), metrics };
-        let (played, check) = match &mut self.simulator {
+        let played = match &mut self.simulator {
             Some(port) => {
                 let simulator = &mut Measured { port, metrics };
-                (play(simulator, order, terms, (actor, advisor), is_traced)?, None)
+                play_traced_slot(simulator, order, terms, actor, advisor, tracing)?
             }
             None => {
                 let served = &mut Measured { port: &mut peers, metrics };
-                let played = play(served, order, terms, (actor, advisor), is_traced)?;
-                let check = determinism::is_checked(order)
-                    .then(|| determinism::check(&mut peers, order, terms, &played.0));
-                (played, check.transpose()?)
+                play_traced_slot(served, order, terms, actor, advisor, tracing)?
             }
         };
-        let (episodes, traces) = played;
+        let (episodes, traces): (Vec<Episode>, Vec<Option<Trace>>) = played.into_iter().unzip();
+        let check = match self.simulator {
+            None if determinism::is_checked(order) => {
+                Some(determinism::check(&mut peers, order, terms, &episodes)?)
+            }
+            _ => None,
+        };
         metrics.record_slot(start, &episodes);
-        let mut traces = traces.into_iter();
-        for (ordered, episode) in order.episodes.iter().zip(&episodes) {
+        for ((ordered, episode), trace) in order.episodes.iter().zip(&episodes).zip(traces) {
             finished_event(episode).emit();
-            self.record(*ordered, episode, traces.next());
+            self.record(*ordered, episode, trace);
         }
         Ok(PlayedSlot { episodes, check, failures: Failures::default() })
+    }
+
+    /// Returns the tracing of episodes of `kind`: on for training episodes that are recorded. Evaluation episodes are
+    /// simulated again instead.
+    fn tracing(&self, kind: EpisodeKind) -> Tracing {
+        let records_training = self.recorder.as_ref().is_some_and(Recorder::records_training);
+        match kind {
+            EpisodeKind::Training if records_training => Tracing::On,
+            _ => Tracing::Off,
+        }
     }
 
     /// Passes an episode to the recorder, if its order asks for a log or it has a trace.
@@ -163,21 +174,6 @@ impl Player {
         let recording = Recording { metadata, episode: episode.clone(), trace };
         if is_training { recorder.try_record(recording) } else { recorder.record(recording) }
     }
-}
-
-/// Plays a slot and returns its episodes and, if it is traced, their traces.
-fn play(
-    env: &mut impl Environment,
-    order: &SlotOrder,
-    terms: &RunTerms,
-    (actor, advisor): (&mut Actor, &mut impl Advisor),
-    is_traced: bool,
-) -> Result<(Vec<Episode>, Vec<Trace>), RolloutError> {
-    if is_traced {
-        let played = play_traced_slot(env, order, terms, actor, advisor)?;
-        return Ok(played.into_iter().unzip());
-    }
-    Ok((play_slot(env, order, terms, actor, advisor)?, Vec::new()))
 }
 
 fn finished_event(episode: &Episode) -> EpisodeFinished {
@@ -251,7 +247,7 @@ impl Advisor for PeerChannel {
     }
 }
 
-impl Environment for PeerChannel {
+impl VectorEnv for PeerChannel {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],

@@ -54,7 +54,7 @@ impl Advisor for NoAdvisor {
 }
 
 /// Environments in which the episodes of a slot are played in lock step, one episode in each; n is their number.
-pub trait Environment {
+pub trait VectorEnv {
     /// Starts the episodes of `starts`, each independent of all others, and writes the first observations, shape
     /// `[n, n_observation]`, and the goals, shape `[n, n_goal]`.
     ///
@@ -122,7 +122,7 @@ impl Simulator {
     }
 }
 
-impl Environment for Simulator {
+impl VectorEnv for Simulator {
     fn reset(
         &mut self,
         starts: &[EpisodeStart],
@@ -179,17 +179,19 @@ impl Environment for Simulator {
 
 impl Act for BlindActor {
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
-        self.act(observations, goals, actions);
+        // The inherent method, which takes precedence over that of the trait.
+        Self::act(self, observations, goals, actions);
     }
 }
 
 impl Act for Actor {
+    // Both call the inherent methods, which take precedence over those of the trait.
     fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
-        self.act(observations, goals, actions);
+        Self::act(self, observations, goals, actions);
     }
 
     fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
-        self.asks(observation, goal, action)
+        Self::asks(self, observation, goal, action)
     }
 }
 

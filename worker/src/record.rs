@@ -14,7 +14,7 @@ use tandem_core::{Episode, EpisodeKind, Layout, TaskSpec, WorldSettings};
 use tandem_sim::{Env, SimError, WorldConfig};
 use tandem_telemetry::{EpisodeMetadata, EpisodeRecorder, TransitionRecord};
 
-use crate::rollout::world_of as world_of_order;
+use crate::rollout::world_settings;
 use crate::trace::{Trace, TracedAdvice};
 
 /// A probability of earlier versions: training episodes that started with the hands anywhere above the table.
@@ -102,7 +102,7 @@ pub fn metadata_of(
         parameter_version: episode.parameter_version,
         layout: episode.layout.clone(),
         policy_digest,
-        world: world_of_order(&order, episode.kind, terms)
+        world: world_settings(&order, episode.kind, terms)
             .log_entries()
             .into_iter()
             .map(|(key, value)| (key.to_owned(), value))

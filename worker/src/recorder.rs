@@ -56,7 +56,7 @@ impl Recorder {
         Ok(Self { queue, episodes: config.episodes, left_out_logged: Arc::default() })
     }
 
-    /// Returns whether training episodes are recorded.
+    /// Returns true if training episodes are recorded.
     pub(crate) fn records_training(&self) -> bool {
         self.episodes == RecordedEpisodes::All
     }
@@ -158,7 +158,7 @@ mod tests {
     use crate::ports::{Act, Simulator};
     use crate::record::metadata_of;
     use crate::replay::replay_log;
-    use crate::rollout::{play_slot, play_traced_slot};
+    use crate::rollout::{Tracing, play_slot, play_traced_slot};
 
     fn simulator() -> Simulator {
         let config = WorldConfig::from(terms().world);
@@ -175,12 +175,13 @@ mod tests {
             &terms,
             &mut FakeActor::Seeker,
             &mut teacher,
+            Tracing::On,
         );
         let played = played.expect("no step fails").into_iter().zip(&order.episodes);
-        let recording = |((episode, trace), order): ((Episode, Trace), &EpisodeOrder)| Recording {
+        let recording = |((episode, trace), order): ((Episode, _), &EpisodeOrder)| Recording {
             metadata: metadata_of(*order, &episode, &terms, "5f3a".to_owned()),
             episode,
-            trace: Some(trace),
+            trace,
         };
         played.map(recording).collect()
     }
@@ -229,8 +230,10 @@ mod tests {
         let (order, terms) = (slot(&[3], true), terms());
         let mut teacher = FakeTeacher::new(|_, _, arm| arm == 0);
         let actor = &mut AsksSometimes { n_steps: 0 };
-        let played = play_traced_slot(&mut simulator(), &order, &terms, actor, &mut teacher);
+        let (env, tracing) = (&mut simulator(), Tracing::On);
+        let played = play_traced_slot(env, &order, &terms, actor, &mut teacher, tracing);
         let (episode, trace) = played.expect("no step fails").remove(0);
+        let trace = trace.expect("traced");
         assert_eq!(trace.advice.len(), episode.n_steps());
         for (step_idx, advice) in trace.advice.iter().enumerate() {
             assert_eq!(advice.arms.len(), if step_idx % 2 == 1 { 2 } else { 0 }, "{step_idx}");

@@ -4,7 +4,7 @@ use tandem_core::{Contacts, TaskSpec};
 use tandem_telemetry::{EpisodeLog, LoggedTransition};
 
 use crate::config::EnvironmentConfig;
-use crate::environment::{Environments, Failure};
+use crate::environment::{EnvironmentClient, Failure};
 use crate::record::{RecordError, rewards_per_arm, start_of, world_of};
 
 /// Simulates a log's actions again and compares observations, goals, contacts and rewards with the log, bit for bit. A
@@ -35,7 +35,7 @@ pub fn replay_log(log: &EpisodeLog) -> Result<(), RecordError> {
 pub async fn replay_log_on(config: EnvironmentConfig, log: &EpisodeLog) -> Result<(), RecordError> {
     let environment = |error| RecordError::Environment(Box::new(error));
     let comparison = Comparison::of(log)?;
-    let mut environments = Environments::new(config);
+    let mut environments = EnvironmentClient::new(config);
     environments.check(comparison.task).await.map_err(environment)?;
     loop {
         match comparison.play_on(&mut environments).await {
@@ -81,7 +81,7 @@ impl<'a> Comparison<'a> {
         Ok(Self { log, task: &log.metadata.layout })
     }
 
-    async fn play_on(self, environments: &mut Environments) -> Result<(), PlayError> {
+    async fn play_on(self, environments: &mut EnvironmentClient) -> Result<(), PlayError> {
         let start = start_of(&self.log.metadata)?;
         let reset = environments.reset(&[start], self.task).await?;
         let mut observation = reset.observations;

@@ -10,7 +10,7 @@ use tandem_sim::SimError;
 use tandem_telemetry::events::StepAdvised;
 
 use crate::explore::Explorer;
-use crate::ports::{Act, Advisor, AdvisorGone, Environment, EnvironmentError};
+use crate::ports::{Act, Advisor, AdvisorGone, EnvironmentError, VectorEnv};
 use crate::trace::{Trace, TracedAdvice};
 
 /// An error that ends a slot.
@@ -61,6 +61,15 @@ pub enum RolloutError {
     },
 }
 
+/// Selects the results of a slot: its episodes alone, or with their traces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Tracing {
+    /// The episodes alone.
+    Off,
+    /// Every episode with its trace.
+    On,
+}
+
 /// Plays the episodes of `order` in lock step, so that one request for advice serves all of them, and returns them in
 /// that order.
 ///
@@ -70,42 +79,33 @@ pub enum RolloutError {
 /// # Errors
 /// When the advisor is gone or answers in the wrong shape, or a step of the environment fails.
 pub fn play_slot(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
 ) -> Result<Vec<Episode>, RolloutError> {
-    let rollouts = play(env, order, terms, (actor, advisor), false)?;
-    Ok(rollouts.into_iter().map(|rollout| rollout.episode).collect())
+    let played = play_traced_slot(env, order, terms, actor, advisor, Tracing::Off)?;
+    Ok(played.into_iter().map(|(episode, _)| episode).collect())
 }
 
-/// Plays as [`play_slot`], and also returns the trace of each episode, for its log. The episodes are the same.
+/// Plays as [`play_slot`]. Returns each episode with its trace, for its log, if `tracing` is on. The episodes are the
+/// same.
 ///
 /// # Errors
 /// As [`play_slot`].
 pub fn play_traced_slot(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
     actor: &mut impl Act,
     advisor: &mut impl Advisor,
-) -> Result<Vec<(Episode, Trace)>, RolloutError> {
-    let rollouts = play(env, order, terms, (actor, advisor), true)?;
-    let traced = |rollout: Rollout| (rollout.episode, rollout.trace.unwrap_or_default());
-    Ok(rollouts.into_iter().map(traced).collect())
-}
-
-/// Plays the episodes of `order`, each with a trace if `is_traced`.
-fn play(
-    env: &mut impl Environment,
-    order: &SlotOrder,
-    terms: &RunTerms,
-    (actor, advisor): (&mut impl Act, &mut impl Advisor),
-    is_traced: bool,
-) -> Result<Vec<Rollout>, RolloutError> {
+    tracing: Tracing,
+) -> Result<Vec<(Episode, Option<Trace>)>, RolloutError> {
     let mut rollouts = start(env, order, terms)?;
-    rollouts.iter_mut().for_each(|rollout| rollout.trace = is_traced.then(Trace::default));
+    if tracing == Tracing::On {
+        rollouts.iter_mut().for_each(|rollout| rollout.trace = Some(Trace::default()));
+    }
     let mut batch = StepBatch::new(order.episodes.len(), &terms.layout);
     for step_idx in 0..terms.layout.episode_steps() {
         trace_scenes(&mut rollouts, env);
@@ -119,11 +119,11 @@ fn play(
     for (environment, rollout) in rollouts.iter_mut().enumerate() {
         rollout.episode.avoidance_steps = env.avoidance_steps(environment);
     }
-    Ok(rollouts)
+    Ok(rollouts.into_iter().map(|rollout| (rollout.episode, rollout.trace)).collect())
 }
 
 /// Adds the scenes of this moment to the traces.
-fn trace_scenes(rollouts: &mut [Rollout], env: &impl Environment) {
+fn trace_scenes(rollouts: &mut [Rollout], env: &impl VectorEnv) {
     for (environment, rollout) in rollouts.iter_mut().enumerate() {
         if let Some(trace) = &mut rollout.trace {
             trace.scenes.extend(env.scene(environment));
@@ -138,13 +138,13 @@ pub fn episode_starts(order: &SlotOrder, terms: &RunTerms) -> Vec<EpisodeStart> 
         number: episode.number,
         seed: episode.seed,
         kind: order.kind,
-        world: world_of(episode, order.kind, terms),
+        world: world_settings(episode, order.kind, terms),
     };
     order.episodes.iter().map(start).collect()
 }
 
-/// Returns the world of an episode. It depends on how far the run had come when the episode was ordered.
-pub(crate) fn world_of(
+/// Returns the settings of an episode's world. They depend on how far the run had come when the episode was ordered.
+pub(crate) fn world_settings(
     episode: &EpisodeOrder,
     kind: EpisodeKind,
     terms: &RunTerms,
@@ -155,7 +155,7 @@ pub(crate) fn world_of(
 
 /// Starts the episodes of `order`.
 fn start(
-    env: &mut impl Environment,
+    env: &mut impl VectorEnv,
     order: &SlotOrder,
     terms: &RunTerms,
 ) -> Result<Vec<Rollout>, RolloutError> {
@@ -195,7 +195,7 @@ impl StepBatch {
         &mut self,
         rollouts: &mut [Rollout],
         step_idx: usize,
-        env: &mut impl Environment,
+        env: &mut impl VectorEnv,
     ) -> Result<(), RolloutError> {
         let Self { layout, actions, observations, contacts } = self;
         for (rollout, action) in rollouts.iter().zip(actions.chunks_exact_mut(layout.n_action())) {
@@ -236,33 +236,51 @@ fn take_advice(
         AdviceUnit::SlotStep => rollouts.iter().position(|rollout| rollout.order.advised),
     };
     let payer = payer_idx.map(|idx| rollouts[idx].episode.number);
-    let (mut advised, others): (Vec<&mut Rollout>, Vec<&mut Rollout>) =
+    let (mut asking, others): (Vec<&mut Rollout>, Vec<&mut Rollout>) =
         rollouts.iter_mut().partition(|rollout| rollout.asks);
     for trace in others.into_iter().filter_map(|rollout| rollout.trace.as_mut()) {
         trace.advice.push(TracedAdvice::default());
     }
-    let Some(first) = advised.first() else {
+    let Some(first) = asking.first() else {
         return Ok(());
     };
     let first_number = first.episode.number;
-    let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
-    let queries: Vec<StepQuery> = advised.iter().map(query).collect();
-    let answers = advisor.advise(queries)?;
-    for rollout in &mut advised {
-        *rollout.episode.queried_steps.get_or_insert(0) += 1;
-    }
-    check_count(first_number, step_idx, "steps", answers.len(), advised.len())?;
-    for (rollout, advice) in advised.iter_mut().zip(&answers) {
-        rollout.apply_advice(advice, step_idx)?;
-    }
+    let answers = ask(&mut asking, step_idx, payer, advisor)?;
+    check_count(first_number, step_idx, "steps", answers.len(), asking.len())?;
     let budget_left = advisor.budget_left();
-    for (rollout, advice) in advised.iter_mut().zip(answers) {
+    for (rollout, advice) in asking.into_iter().zip(answers) {
+        rollout.apply_advice(&advice, step_idx)?;
         if let Some(trace) = &mut rollout.trace {
             trace.advice.push(TracedAdvice { arms: advice.arms, budget_left });
         }
     }
-    // A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
-    // teacher's account includes that unit, but no episode claims it.
+    claim_units(rollouts, payer_idx);
+    Ok(())
+}
+
+/// Returns the teacher's advice on the next actions of the rollouts, which count the query. The episode `payer` pays
+/// for all of them if there is one.
+fn ask(
+    rollouts: &mut [&mut Rollout],
+    step_idx: usize,
+    payer: Option<u64>,
+    advisor: &mut impl Advisor,
+) -> Result<Vec<StepAdvice>, RolloutError> {
+    let query = |rollout: &&mut Rollout| StepQuery { payer, ..rollout.query(step_idx) };
+    let queries: Vec<StepQuery> = rollouts.iter().map(query).collect();
+    let answers = advisor.advise(queries)?;
+    for rollout in rollouts {
+        *rollout.episode.queried_steps.get_or_insert(0) += 1;
+    }
+    Ok(answers)
+}
+
+/// Adds the units for the advice on this step to the episodes: one for each episode with overridden arms, or one for
+/// all of them to the payer's.
+///
+/// A step without overridden arms may carry a charge, from a previous worker whose student acted differently. The
+/// teacher's account includes that unit, but no episode claims it.
+fn claim_units(rollouts: &mut [Rollout], payer_idx: Option<usize>) {
     match payer_idx {
         None => {
             for rollout in rollouts {
@@ -274,7 +292,6 @@ fn take_advice(
             rollouts[idx].episode.advice_charged += u32::from(any);
         }
     }
-    Ok(())
 }
 
 fn check_count(

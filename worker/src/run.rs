@@ -9,14 +9,14 @@ use tokio_util::task::TaskTracker;
 use tracing::Instrument as _;
 
 use crate::config::{RecordingConfig, Timeouts, WorkerConfig};
-use crate::environment::{Environments, Failure};
+use crate::environment::{EnvironmentClient, Failure};
 use crate::error::Error;
-use crate::learner::{Learner, Work};
+use crate::learner::{LearnerClient, Work};
 use crate::metrics::WorkerMetrics;
 use crate::player::{AdviceReply, PeerChannel, PeerRequest, PlayedSlot, Player};
 use crate::recorder::Recorder;
 use crate::rollout::RolloutError;
-use crate::teacher::Teacher;
+use crate::teacher::TeacherClient;
 
 /// Plays slots for a learner until the run has ended or `shutdown` is cancelled. After a shutdown signal the current
 /// slot is delivered first, if that takes a few seconds at most.
@@ -45,10 +45,11 @@ pub async fn run_with(
         Some(recording) => Some(start_recorder(recording.clone(), &rollouts)?),
         None => None,
     };
-    let (learner, teacher) = (Learner::new(&config, timeouts)?, Teacher::new(&config, timeouts)?);
+    let (learner, teacher) =
+        (LearnerClient::new(&config, timeouts)?, TeacherClient::new(&config, timeouts)?);
     let pacing = config.pacing;
     let metrics = WorkerMetrics::register(config.client.metrics());
-    let environments = config.environment.clone().map(Environments::new);
+    let environments = config.environment.clone().map(EnvironmentClient::new);
     let mut worker = Worker {
         config,
         timeouts,
@@ -84,10 +85,10 @@ fn start_recorder(config: RecordingConfig, threads: &TaskTracker) -> Result<Reco
 struct Worker {
     config: WorkerConfig,
     timeouts: Timeouts,
-    learner: Learner,
-    teacher: Option<Teacher>,
+    learner: LearnerClient,
+    teacher: Option<TeacherClient>,
     /// The server of the environments; `None` if they are simulated in this process.
-    environments: Option<Environments>,
+    environments: Option<EnvironmentClient>,
     metrics: WorkerMetrics,
     /// The thread that writes logs, if there are any.
     recorder: Option<Recorder>,
@@ -201,19 +202,20 @@ impl Worker {
             let (player, played) = self.play(member.player, order, trace).await?;
             let submission = trace.child("submit", 0);
             let submitted = self.learner.submit(worker_id, slot, &played, submission);
-            let taken = submitted.instrument(submission.span(Some(trace), "submit", "client"));
-            Ok::<_, Error>((player, taken.await?))
+            let submitted = submitted.instrument(submission.span(Some(trace), "submit", "client"));
+            Ok::<_, Error>((player, submitted.await?))
         };
         let span = trace.span(None, "slot", "internal");
-        let (player, taken) = delivered.instrument(span).await?;
-        if taken.is_none() {
+        let (player, is_known) = delivered.instrument(span).await?;
+        if !is_known {
             // Such a learner does not know the slot either and orders its episodes again.
             tracing::warn!(worker_id, slot, "unknown to the learner, joining again");
+            return Ok(None);
         }
-        Ok(taken.map(|()| Membership { worker_id, player }))
+        Ok(Some(Membership { worker_id, player }))
     }
 
-    /// Loads the parameters of `version` into the player. Returns false if the learner no longer has them.
+    /// Loads the parameters that play `order` into the player. Returns false if the learner no longer has them.
     async fn fetch_parameters(
         &mut self,
         player: &mut Player,
@@ -331,7 +333,7 @@ impl Worker {
         teacher.advise(account, task, queries, call).instrument(span).await
     }
 
-    /// Forwards a request to the server of the environments. Returns whether the player still waits for the response.
+    /// Forwards a request to the server of the environments. Returns true if the player still waits for the response.
     async fn forward(&mut self, request: PeerRequest, task: &TaskSpec) -> Result<bool, Failure> {
         let no_server = || Failure::Final(Box::new(Error::NoServer));
         self.environments.as_mut().ok_or_else(no_server)?.answer(request, task).await

@@ -3,40 +3,32 @@
 use tandem_core::{StepQuery, TaskSpec};
 use tandem_net::{AuthChannel, MAX_MESSAGE_BYTES, Operation, Retrier, TraceContext, within};
 use tandem_proto::pb;
-use tandem_proto::pb::teacher_client::TeacherClient;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Status};
 
 use crate::config::{Timeouts, WorkerConfig};
 use crate::error::{CallError, Error, expect_same};
 use crate::player::AdviceReply;
+use crate::request_stream::RequestStream;
 
 const ADVISE: Operation = Operation { peer: "teacher", purpose: "ask the teacher" };
-/// The capacity of an advice stream, in requests. One request is open at a time, so the worker never waits for room.
-const STREAM_CAPACITY: usize = 1;
 
-/// The teacher of a run, asked over one stream. Requests are repeated until the teacher answers.
+type Rpc = pb::teacher_client::TeacherClient<AuthChannel>;
+
+/// The client of a run's teacher, which is asked over one stream. Requests are repeated until the teacher answers.
 #[derive(Debug)]
-pub(crate) struct Teacher {
-    client: TeacherClient<AuthChannel>,
+pub(crate) struct TeacherClient {
+    client: Rpc,
     timeouts: Timeouts,
-    stream: Option<AdviceStream>,
+    stream: Option<RequestStream<pb::AdviseRequest, pb::AdviseResponse>>,
 }
 
-#[derive(Debug)]
-struct AdviceStream {
-    requests: mpsc::Sender<pb::AdviseRequest>,
-    responses: Streaming<pb::AdviseResponse>,
-}
-
-impl Teacher {
+impl TeacherClient {
     /// Creates a client, which connects on its first call; `None` if the configuration names no teacher.
     pub(crate) fn new(config: &WorkerConfig, timeouts: Timeouts) -> Result<Option<Self>, Error> {
         let Some(address) = &config.teacher else { return Ok(None) };
         let channel = config.client.channel(address);
         let channel = channel.map_err(|source| Error::Address { role: "teacher", source })?;
-        let client = TeacherClient::new(channel)
+        let client = Rpc::new(channel)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         Ok(Some(Self { client, timeouts, stream: None }))
@@ -82,29 +74,14 @@ impl Teacher {
     }
 
     /// Sends one request and waits for its response.
-    ///
-    /// A stream that failed or was abandoned is not reused: its next response could be to an earlier request.
     async fn exchange(&mut self, request: pb::AdviseRequest) -> Result<pb::AdviseResponse, Status> {
-        let mut stream = match self.stream.take() {
-            Some(stream) => {
-                stream.requests.send(request).await.map_err(|_unsent| closed())?;
-                stream
-            }
-            None => self.open(request).await.map_err(with_transient_failures)?,
-        };
-        let response = stream.responses.message().await.map_err(with_transient_failures)?;
-        let response = response.ok_or_else(closed)?;
+        let (client, stream) = (&mut self.client, self.stream.take());
+        let exchanged = RequestStream::exchange(ADVISE.peer, stream, request, |requests| {
+            client.advise_stream(requests)
+        });
+        let (response, stream) = exchanged.await.map_err(with_transient_failures)?;
         self.stream = Some(stream);
         Ok(response)
-    }
-
-    /// Opens a stream with its first request, because some servers do not answer before they have one.
-    async fn open(&mut self, first: pb::AdviseRequest) -> Result<AdviceStream, Status> {
-        let (requests, outgoing) = mpsc::channel(STREAM_CAPACITY);
-        requests.send(first).await.map_err(|_unsent| closed())?;
-        let responses =
-            self.client.advise_stream(ReceiverStream::new(outgoing)).await?.into_inner();
-        Ok(AdviceStream { requests, responses })
     }
 }
 
@@ -115,8 +92,4 @@ fn with_transient_failures(status: Status) -> Status {
         Code::NotFound | Code::FailedPrecondition => Status::unavailable(status.message()),
         _ => status,
     }
-}
-
-fn closed() -> Status {
-    Status::unavailable("the teacher closed the advice stream")
 }

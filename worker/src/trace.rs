@@ -1,4 +1,4 @@
-//! What a log shows of an episode beyond the episode itself.
+//! The part of a log that an episode itself does not contain.
 
 use tandem_core::ArmAdvice;
 use tandem_core::scene::Scene;

@@ -8,8 +8,9 @@ use crate::layout::{ArmIndex, Layout};
 impl TaskSpec {
     /// Returns the one-arm task of which each arm's part is an instance: the task of a teacher.
     ///
-    /// Returns `None` if the arms have common numbers, or an arm achieves its goal outside its own observation. A task
-    /// of one arm is its own one-arm task if its vectors have the order of the arm's parts.
+    /// Returns `None` if the arms have common numbers, an arm achieves its goal outside its own observation, or the
+    /// tasks of two arms differ, for example in bounds or conditions. A task of one arm is its own one-arm task if its
+    /// vectors have the order of the arm's parts.
     #[must_use]
     pub fn single_arm(&self) -> Option<Self> {
         if self.n_arms() == 1 && self.is_in_arm_order() {
@@ -18,8 +19,15 @@ impl TaskSpec {
         if let Some(layout) = self.as_built_in() {
             return Some(layout.single_arm().into());
         }
+        let mut of_arms = self.arms().map(|arm| self.task_of_arm(arm));
+        let first = of_arms.next()??;
+        of_arms.all(|other| other.as_ref() == Some(&first)).then_some(first)
+    }
+
+    /// Returns the task that remains if all arms but `arm` are removed; `None` if its part is not a task of its own.
+    fn task_of_arm(&self, arm_idx: ArmIndex) -> Option<Self> {
         let description = self.description();
-        let arm = &description.arms[0];
+        let arm = &description.arms[arm_idx.0];
         let has_common = !self.common_observation().is_empty() || !self.common_goal().is_empty();
         let in_own = |idx: &usize| {
             let achieved = description.achieved_goal[*idx];
@@ -31,7 +39,7 @@ impl TaskSpec {
         }
         let own = |n: usize| (0..n).collect::<Vec<usize>>();
         let bounds = |part: &Part, bounds: &[f32]| part.of(bounds).into_owned();
-        let (observation, goal) = (self.observation_of(ArmIndex(0)), self.goal_of(ArmIndex(0)));
+        let (observation, goal) = (self.observation_of(arm_idx), self.goal_of(arm_idx));
         Self::new(TaskDescription {
             n_observation: arm.observation.len(),
             n_goal: arm.goal.len(),
@@ -56,7 +64,7 @@ impl TaskSpec {
                 "" => description.name.clone(),
                 other => other.to_owned(),
             },
-            manipulation: of_one_arm(description)?,
+            manipulation: manipulation_of(description, arm_idx)?,
             reflection: Reflection { whole_scene: false, ..description.reflection.clone() },
             ..description.clone()
         })
@@ -126,18 +134,18 @@ impl TaskSpec {
     }
 }
 
-/// Returns the first arm's manipulation in vectors of its own; the default if its task is another one.
-fn of_one_arm(task: &TaskDescription) -> Option<Manipulation> {
+/// Returns an arm's manipulation in vectors of its own; the default if its task is another one.
+fn manipulation_of(task: &TaskDescription, arm: ArmIndex) -> Option<Manipulation> {
     if !task.manipulation.one_arm_task.is_empty() {
         return Some(Manipulation::default());
     }
-    let own = &task.arms[0];
+    let own = &task.arms[arm.0];
     let place = |part: &[usize], idx: usize| part.iter().position(|own| *own == idx);
-    let reindexed = task.manipulation.arms.first().map(|arm| {
-        arm.reindexed(|idx| place(&own.observation, idx), |idx| place(&own.action, idx))
+    let reindexed = task.manipulation.arms.get(arm.0).map(|manipulation| {
+        manipulation.reindexed(|idx| place(&own.observation, idx), |idx| place(&own.action, idx))
     });
     let arms = match reindexed {
-        Some(arm) => vec![arm?],
+        Some(manipulation) => vec![manipulation?],
         None => Vec::new(),
     };
     let success_steps = task.manipulation.success_steps;

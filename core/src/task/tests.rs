@@ -118,6 +118,27 @@ fn each_arm_is_an_instance_of_the_one_arm_task() {
 }
 
 #[test]
+fn arms_whose_parts_differ_have_no_one_arm_task() {
+    let single_arm = |change: fn(&mut TaskDescription)| {
+        let mut description = interleaved();
+        description.arms.iter_mut().for_each(|arm| arm.position.clear());
+        description.manipulation.arms = vec![holding(0), holding(1)];
+        change(&mut description);
+        TaskSpec::new(description).unwrap().single_arm()
+    };
+    assert!(single_arm(|_| ()).is_some());
+    let check = |difference: &str, change: fn(&mut TaskDescription)| {
+        assert_eq!(single_arm(change), None, "{difference}");
+    };
+    check("the order of an observation", |t| t.arms[1].observation = vec![3, 1]);
+    check("the number that achieves the goal", |t| t.achieved_goal[0] = 3);
+    check("a number of the other arm achieves the goal", |t| t.achieved_goal[0] = 0);
+    check("a bound", |t| t.observation_bound[3] = 1.0);
+    check("the gripper", |t| t.manipulation.arms[1].gripper = None);
+    check("a condition", |t| t.manipulation.arms[1].conditions[0].tolerance = 0.3);
+}
+
+#[test]
 fn a_reflection_acts_on_the_part_of_one_arm_and_is_its_own_inverse() {
     let mut description = interleaved();
     description.reflection = Reflection {

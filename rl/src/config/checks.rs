@@ -60,8 +60,7 @@ impl RunConfig {
     fn check_advice(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
         let strategy = self.advice.strategy.as_str();
         let can_be_advised = !self.advice.needs_teacher() || layout.single_arm().is_some();
-        let expected =
-            "none for this task: the arms have common numbers, so none has a task of its own";
+        let expected = "none for this task: its arms are not instances of one task of one arm";
         check("advice.strategy", strategy, can_be_advised, expected)?;
         OutOfRange::check_fraction("advice.share", self.advice.share)?;
         let budget = self.advice_budget();

@@ -57,8 +57,8 @@ fn percentile_90_m(differences_m: &[Vec<f32>], step: usize) -> f32 {
     sorted[sorted.len() * 9 / 10]
 }
 
-fn world_of_two() -> World {
-    World::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default())
+fn world_of_two() -> PhysicsWorld {
+    PhysicsWorld::build(Layout::new(Task::PickAndPlace, 2), &WorldConfig::default())
 }
 
 /// The contacts of hands that stay at `hands`, in arm frames, for a control step.
@@ -115,7 +115,7 @@ fn contacts_between_hands_and_with_the_table_are_distinguished() {
 
 /// The contacts of a control step in which a hand moves by `action` from `hand`, with its cube at the origin.
 fn contacts_of_a_move(task: Task, hand: Vector, action: Vector) -> Contacts {
-    let mut world = World::build(Layout::new(task, 1), &WorldConfig::default());
+    let mut world = PhysicsWorld::build(Layout::new(task, 1), &WorldConfig::default());
     world.place_arm(ARM, hand, 0.0);
     world.place_object(ARM, Vector::new(0.05, 0.0, 0.0225), 0.0);
     world.reset_link_avoidance();
@@ -141,10 +141,10 @@ fn a_hand_that_presses_a_cube_onto_the_table_touches_the_table_in_the_shared_wor
 fn hands_that_come_near_touch_in_a_world_with_a_margin() {
     let contacts_at = |contact_margin_m, apart_m: f32| {
         let config = WorldConfig::default();
-        let mut world = World::build(Layout::new(Task::SharedPush, 2), &config);
+        let mut world = PhysicsWorld::build(Layout::new(Task::SharedPush, 2), &config);
         let mut rng = episode_rng(1, 0, Stream::Reset);
-        let nominal = Episode::draw(&mut rng, Task::SharedPush, &config, 0.0);
-        world.vary(&Episode { contact_margin_m, ..nominal });
+        let nominal = DomainRandomization::draw(&mut rng, Task::SharedPush, &config, 0.0);
+        world.vary(&DomainRandomization { contact_margin_m, ..nominal });
         for arm in [ARM, ArmIndex(1)] {
             world.place_arm(arm, Vector::new(0.12 - 0.5 * apart_m, 0.0, 0.1), 0.0);
             world.place_object(arm, Vector::new(-0.1, 0.2, 0.0225), 0.0);

@@ -81,7 +81,8 @@ fn arm_start(
         (Vector::new(x, y, z), THREE_FINGERS.max_opening_m)
     };
     let object_yaw_rad = start.yaw_rad;
-    ArmStart { end_effector, opening_m, object, object_yaw_rad, goal: handle_of(goal) }
+    let goal = handle_of(goal);
+    ArmStart { end_effector, opening_m, object, object_yaw_rad, holds_object: is_held, goal }
 }
 
 impl BarPose {

@@ -35,7 +35,7 @@ const HAND_SEPARATION_M: f32 = 0.17;
 const HOLD_HEIGHT_M: f32 = 0.03;
 /// Smallest distance along y, metres, at which a hand passes the forearm of an arm that holds its object.
 const PASSING_M: f32 = 0.22;
-/// Height of the end effector from which a hand is clear of all objects, metres.
+/// Height of the end effector from which a hand is clear of objects with edges of up to 7.2 cm, metres.
 const CLEAR_HEIGHT_M: f32 = 0.11;
 /// Gap between the open fingers and an object, metres.
 const FINGER_GAP_M: f32 = 0.01;
@@ -95,6 +95,7 @@ impl Sampler {
                 opening_m: self.object_half_m,
                 object,
                 object_yaw_rad: self.grasped_yaw_rad(end_effector),
+                holds_object: true,
                 goal,
             };
         }
@@ -104,6 +105,7 @@ impl Sampler {
             object: self.object(rng),
             // A cube looks the same after a quarter of a turn.
             object_yaw_rad: uniform(rng, -FRAC_PI_4, FRAC_PI_4),
+            holds_object: false,
             goal,
         }
     }

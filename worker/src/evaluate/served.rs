@@ -6,7 +6,7 @@ use tokio::sync::oneshot;
 
 use super::{evaluation_terms, slot_of};
 use crate::config::EnvironmentConfig;
-use crate::environment::{Environments, Failure};
+use crate::environment::{EnvironmentClient, Failure};
 use crate::error::Error;
 use crate::player::PeerChannel;
 use crate::ports::{Act, NoAdvisor};
@@ -29,7 +29,7 @@ pub async fn evaluate_served<A: Act + Clone + Send + 'static>(
     (n_episodes, seed): (u64, u64),
     take: &mut dyn FnMut(Vec<Episode>),
 ) -> Result<(), Error> {
-    let mut environments = Environments::new(config);
+    let mut environments = EnvironmentClient::new(config);
     let n_per_slot = environments.check(task).await?.min(MAX_EPISODES);
     let terms = evaluation_terms(task);
     for first in (0..n_episodes).step_by(n_per_slot) {
@@ -41,7 +41,7 @@ pub async fn evaluate_served<A: Act + Clone + Send + 'static>(
 
 /// Plays a slot, and repeats it after failures of the server.
 async fn play<A: Act + Clone + Send + 'static>(
-    environments: &mut Environments,
+    environments: &mut EnvironmentClient,
     actor: &A,
     order: &SlotOrder,
     terms: &RunTerms,
@@ -59,7 +59,7 @@ async fn play<A: Act + Clone + Send + 'static>(
 
 /// Plays a slot on a thread of its own, and forwards its requests to the server.
 async fn try_play<A: Act + Send + 'static>(
-    environments: &mut Environments,
+    environments: &mut EnvironmentClient,
     mut actor: A,
     order: &SlotOrder,
     terms: &RunTerms,

@@ -12,7 +12,7 @@ use tandem_proto::environment::{
 use tandem_proto::pb;
 use tandem_sim::{Env, WorldConfig};
 use tandem_worker::EnvironmentConfig;
-use tandem_worker::ports::{Environment as _, Simulator};
+use tandem_worker::ports::{Simulator, VectorEnv as _};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
