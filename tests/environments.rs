@@ -155,7 +155,10 @@ fn an_evaluation_on_a_server_gives_the_results_of_one_in_this_process() {
             let mut eval = tandem();
             eval.args(["eval", "--json", "--episodes", "20"]).args(policy).args(more);
             let mut result = summary(&eval.output().expect("runs"));
-            result.as_object_mut().expect("an object").remove("steps_per_s");
+            let values = result.as_object_mut().expect("an object");
+            values.remove("steps_per_s");
+            let avoidance = values.remove("avoidance_rate");
+            assert_eq!(avoidance.is_some(), more.is_empty(), "only the simulator counts it");
             result
         };
         assert_eq!(eval(&environment), eval(&[]), "{policy:?}");

@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn a_torque_of_a_state_that_is_replaced_counts() {
         let mut states: Vec<PairState> = (5..8).map(state).collect();
-        let torques_nm = [[0.5, -9.0, 1.0, 0.0], [2.0, 3.0, -1.0, 0.0], [-1.0, 4.0, 0.5, 0.0]];
+        let torques_nm = [[0.5, -9.0, 1.5, 0.0], [2.0, 3.0, -1.0, 0.0], [-1.0, 4.0, 0.5, 0.0]];
         for (state, torques_nm) in states.iter_mut().zip(torques_nm) {
             state.arms[1].torques_nm = Some(Joints::new(&torques_nm));
         }
@@ -110,7 +110,7 @@ mod tests {
             states.iter().flat_map(|state| to_bytes(&encode_state(state).unwrap())).collect();
         let newest = StateBuffer::default().push(&sent).unwrap().unwrap();
         assert_eq!(newest.arms[0].torques_nm, None);
-        assert_eq!(newest.arms[1].torques_nm, Some(Joints::new(&[2.0, -9.0, 1.0, 0.0])));
+        assert_eq!(newest.arms[1].torques_nm, Some(Joints::new(&[2.0, -9.0, 1.5, 0.0])));
         assert_eq!(newest.arms[1].angles, state(7).arms[1].angles);
     }
 
