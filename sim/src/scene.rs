@@ -50,16 +50,23 @@ pub(crate) fn scene(
     }
 }
 
-/// Returns the boxes that show a bar: the handle of each arm, in arm order and centred at the point that the arm brings to
-/// its goal, and then the middle.
+/// Returns the boxes that show a bar: the handle of each arm, in arm order and centred at the point that the arm brings
+/// to its goal, then what remains of each arm's section beside the plate, and the plate.
 fn bar_boxes(bar: &RigidBody) -> Vec<Cuboid> {
     let (at, turn): (Vector, Rotation) = (bar.translation(), *bar.rotation());
     let handle_half_m = HALF_LENGTH_M - HANDLE_M;
-    let section = |half_length_m| Vector::new(half_length_m, SECTION_HALF_M, SECTION_HALF_M);
-    let handles = (0..MAX_ARMS)
-        .map(|arm| cuboid(at + turn * handle(ArmIndex(arm)), turn, section(handle_half_m)));
-    let middle = section(HANDLE_M - handle_half_m);
-    handles.chain([cuboid(at, turn, middle), cuboid(at, turn, PLATE_HALF_M)]).collect()
+    let rest_half_m = 0.5 * (HALF_LENGTH_M - PLATE_HALF_M.x) - handle_half_m;
+    let rest_share = (PLATE_HALF_M.x + rest_half_m) / HANDLE_M;
+    // Each arm's box whose centre is at this share of the way from the bar's centre to the handle.
+    let sections = |half_length_m: f32, share: f32| {
+        let half_m = Vector::new(half_length_m, SECTION_HALF_M, SECTION_HALF_M);
+        (0..MAX_ARMS)
+            .map(move |arm| cuboid(at + turn * (handle(ArmIndex(arm)) * share), turn, half_m))
+    };
+    sections(handle_half_m, 1.0)
+        .chain(sections(rest_half_m, rest_share))
+        .chain([cuboid(at, turn, PLATE_HALF_M)])
+        .collect()
 }
 
 fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
@@ -129,5 +136,35 @@ fn cuboid(centre: Vector, orientation: Rotation, half_extents_m: Vector) -> Cubo
         centre: centre.to_array(),
         orientation: orientation.to_array(),
         half_extents_m: half_extents_m.to_array(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::{Stream, Task, WorldSettings, episode_rng};
+
+    use super::*;
+    use crate::description::Geometry;
+    use crate::{Env, WorldConfig};
+
+    #[test]
+    fn a_bar_is_drawn_with_the_volume_that_is_simulated() {
+        let layout = Layout::new(Task::CarryBar, 2);
+        let mut env = Env::new(layout, &WorldConfig::default()).unwrap();
+        env.reset(&mut episode_rng(1, 0, Stream::Reset), WorldSettings::default());
+        let volume = |half_m: [f32; 3]| 8.0 * half_m.iter().product::<f32>();
+        let world = env.description();
+        let of_bar = world.shapes.iter().filter(|shape| shape.body == Some(world.arms[0].object));
+        let simulated: f32 = of_bar
+            .map(|shape| match shape.geometry {
+                Geometry::BoxHalfExtentsM(half_m) => volume(half_m),
+                Geometry::CapsuleRadiusAndHalfLengthM(_) => panic!("a bar has no capsules"),
+            })
+            .sum();
+        let boxes = env.scene().objects;
+        let drawn: f32 = boxes.iter().map(|shown| volume(shown.half_extents_m)).sum();
+        assert!((drawn - simulated).abs() < 1e-3 * simulated, "{drawn} m³, not {simulated} m³");
+        let handles = [0, 1].map(|arm| Vector::from_array(boxes[arm].centre));
+        assert!((handles[0].distance(handles[1]) - 2.0 * HANDLE_M).abs() < 1e-5);
     }
 }

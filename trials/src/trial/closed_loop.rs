@@ -66,8 +66,8 @@ struct LoopState {
     n_done: usize,
     /// The number of consecutive judgements, up to now, that found the task achieved.
     n_in_success: usize,
-    /// Whether an arm holds an object that all arms share.
-    carries: bool,
+    /// Whether each arm holds an object that all arms share.
+    holds: Vec<bool>,
     progress: Progress,
     /// Whether each gripper opens only as wide as its object needs, because another object lies next to it.
     narrow: Vec<bool>,
@@ -130,8 +130,9 @@ impl<'a, 'rig> ClosedLoop<'a, 'rig> {
         let misplaced: Vec<bool> = runner.misplaced(&objects, self.start).collect();
         state.progress.see(&positions, &misplaced);
         state.count_done(&now, &self.start.goals, runner.tolerance_m(), meets);
-        state.carries = runner.task.shares_object()
-            && layout.arms().any(|arm| runner.task.arm_holds(arm, &observation));
+        let shares_object = runner.task.shares_object();
+        let holds = |arm| shares_object && runner.task.arm_holds(arm, &observation);
+        state.holds = layout.arms().map(holds).collect();
         let blocks = runner.observed_blocks(&objects, self.start.shared.as_ref());
         if self.withdraw(&blocks)? {
             return Ok(false);
@@ -216,7 +217,7 @@ impl LoopState {
             before: None,
             n_done: 0,
             n_in_success: 0,
-            carries: false,
+            holds: vec![false; joint_angles.len()],
             progress: Progress::new(joint_angles.len()),
             narrow: vec![false; joint_angles.len()],
             withdraw: None,
@@ -231,6 +232,16 @@ impl LoopState {
     fn append_waypoints(&mut self, step: [Waypoint; 5]) {
         let n_known = usize::from(!self.waypoints.is_empty());
         self.waypoints.extend(step.into_iter().skip(n_known));
+    }
+
+    /// Returns whether an arm holds an object that all arms share.
+    fn carries(&self) -> bool {
+        self.holds.contains(&true)
+    }
+
+    /// Returns whether all arms hold the object that they share.
+    fn all_hold(&self) -> bool {
+        self.holds.iter().all(|holds| *holds)
     }
 
     fn count_success(&mut self, is_success: bool) {

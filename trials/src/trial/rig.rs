@@ -98,18 +98,20 @@ impl<'a> TrialRig<'a> {
         started.map_err(|error| FailureCause::Refused(MotionRefusal::from(error)))
     }
 
-    /// Plays `motion` to its end, or until an external torque shows that an arm presses on something. The arms then
-    /// hold their positions, with their grippers as open as they are. Returns whether the motion came to its end.
+    /// Plays `motion` to its end, or until an external torque shows that an arm that `yields` presses on something. All
+    /// arms then hold their positions, with their grippers as open as they are. Returns whether the motion came to its
+    /// end.
     pub(crate) fn play_yielding(
         &mut self,
         motion: Motion,
         speed: f64,
+        yields: &[bool],
     ) -> Result<bool, FailureCause> {
         let torques = |rig: &Self| -> Vec<f64> {
             let arms = rig.executor.state().map(|state| state.arms.as_slice()).unwrap_or_default();
-            let joints = arms
-                .iter()
-                .flat_map(|arm| arm.torques_nm.iter().flat_map(|torques| torques.iter()));
+            let yielding = arms.iter().zip(yields).filter(|(_, yields)| **yields);
+            let joints = yielding
+                .flat_map(|(arm, _)| arm.torques_nm.iter().flat_map(|torques| torques.iter()));
             joints.map(|torque| torque.abs()).collect()
         };
         let before = torques(self);

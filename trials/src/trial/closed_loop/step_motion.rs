@@ -38,8 +38,8 @@ enum StepPart {
     Retreat,
 }
 
-/// The attempts at a step, in order, until the check allows one. Arms that share an object move together or not at all,
-/// so only the first three remain.
+/// The attempts at a step, in order, until the check allows one. While an arm holds an object that all share, the arms
+/// move together or not at all, so only the first three remain.
 const ATTEMPTS: [[StepPart; 2]; 10] = {
     use StepPart::{Retreat, Share};
     [
@@ -62,7 +62,7 @@ impl ClosedLoop<'_, '_> {
         let runner = self.runner;
         let from = runner.hands(&self.state);
         for (attempt, parts) in ATTEMPTS.iter().enumerate() {
-            if self.state.carries && !is_joint(parts) {
+            if self.state.carries() && !is_joint(parts) {
                 continue;
             }
             let mut to: Vec<DVec3> = (0..from.len())
@@ -71,7 +71,7 @@ impl ClosedLoop<'_, '_> {
                     StepPart::Retreat => from[arm] + RETREAT_OFFSET_M,
                 })
                 .collect();
-            if self.state.carries {
+            if self.state.all_hold() {
                 runner.keep_hands_apart(&from, &mut to);
             }
             let makes_room = parts.iter().any(|part| matches!(part, StepPart::Retreat));
@@ -81,7 +81,7 @@ impl ClosedLoop<'_, '_> {
                 return Ok(is_whole && !self.state.progress.is_held_up());
             }
         }
-        if !self.state.carries {
+        if !self.state.carries() {
             for to in runner.positions_apart(&from, &self.state) {
                 if self.attempt(wanted, &to, &runner.check)? {
                     break;
@@ -117,12 +117,11 @@ impl ClosedLoop<'_, '_> {
         };
         let ends: Vec<Joints> =
             motion.arms.iter().map(|samples| samples[samples.len() - 1].angles).collect();
-        let played = if state.carries {
-            self.rig.play(motion, runner.config.speed).map(|()| true)
-        } else {
-            let share = runner.step_speed(state, wanted, to);
-            self.rig.play_yielding(motion, runner.config.speed * share)
-        };
+        // What a hand that holds the object feels may come from the other one. A free hand that meets the object
+        // yields.
+        let yields: Vec<bool> = state.holds.iter().map(|holds| !holds).collect();
+        let speed = runner.config.speed * runner.step_speed(state, wanted, to);
+        let played = self.rig.play_yielding(motion, speed, &yields);
         let is_whole = match played {
             Err(FailureCause::Refused(_)) => return Ok(false),
             played => played?,
@@ -234,7 +233,7 @@ impl TrialRunner {
                 commanded_m: before * f64::from(MAX_OPENING_M),
             };
             let pads_before = pads(from, near);
-            let path = if state.carries {
+            let path = if state.holds[arm] {
                 let end = lowered(&pads_before, to, blocks);
                 StepPath { points: [from, from.midpoint(end), end], is_held_up: false }
             } else {
@@ -283,4 +282,75 @@ fn is_still(from: &Waypoint, to: &Waypoint) -> bool {
         (from.tool_in_world_m - to.tool_in_world_m).norm() < STILL_DISTANCE_M
             && (from.gripper_opening - to.gripper_opening).abs() < STILL_OPENING_CHANGE
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::Task;
+
+    use super::*;
+    use crate::trial::block_avoidance::ObservedBlock;
+    use crate::trial::rig::{Goals, TrialRig};
+    use crate::trial::runner::start_angles;
+    use crate::trial::{NoObserver, TrialMode, test_config};
+
+    fn runner() -> TrialRunner {
+        TrialRunner::new(test_config(Task::CarryBar, TrialMode::ClosedLoop, 1)).unwrap()
+    }
+
+    #[test]
+    fn hands_keep_their_distance_once_both_hold_the_object() {
+        let mut runner = runner();
+        let start = runner.start(0).unwrap();
+        let joint_angles = start_angles(&runner.mapping, &start).unwrap();
+        // The distance that the first hand moves and the change of the distance between the hands, metres, in a step in
+        // which the second hand is to move by 2 cm.
+        let step = |holds: [bool; 2]| {
+            let pair = runner.pair(&start, &joint_angles, 0, &runner.config.simulated);
+            let (cell, mut observer) = (runner.mapping.cell().clone(), NoObserver);
+            let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer).unwrap();
+            let mut idle = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(0.0);
+            let mut closed_loop =
+                ClosedLoop::new(&runner, &mut rig, &start, &joint_angles, &mut idle);
+            closed_loop.state.holds = holds.to_vec();
+            let from = runner.hands(&closed_loop.state);
+            let inward = DVec3::X * (-0.02 * from[1].x.signum());
+            let openings_m = closed_loop.state.openings_m.clone();
+            let wanted =
+                WantedStep { hands: vec![from[0], from[1] + inward], openings_m, blocks: &[] };
+            assert!(closed_loop.move_hands(&wanted).unwrap(), "{holds:?}");
+            let to = runner.hands(&closed_loop.state);
+            let [before_m, after_m] = [&from, &to].map(|hands| {
+                let pads = runner.pads_of(hands);
+                pads[0].distance(pads[1])
+            });
+            [from[0].distance(to[0]), (after_m - before_m).abs()]
+        };
+        let [moved_m, change_m] = step([true, false]);
+        assert!(moved_m < 1e-3 && change_m > 0.01, "{moved_m} m, {change_m} m");
+        let [moved_m, change_m] = step([true; 2]);
+        assert!(moved_m > 5e-3 && change_m < 1e-3, "{moved_m} m, {change_m} m");
+    }
+
+    #[test]
+    fn a_free_hand_does_not_descend_onto_the_object_that_the_other_one_holds() {
+        let mut runner = runner();
+        let start = runner.start(0).unwrap();
+        let joint_angles = runner.mapping.cell().ready(0.2).unwrap();
+        let mut state = LoopState::new(&start, &joint_angles);
+        state.openings_m = vec![0.0; 2];
+        let hands = runner.hands(&state);
+        let half_m = DVec3::splat(0.03);
+        let below =
+            |pads: &DVec3| ObservedBlock { position: pads.with_z(half_m.z), yaw_rad: 0.0, half_m };
+        let blocks: Vec<ObservedBlock> = runner.pads_of(&hands).iter().map(below).collect();
+        let to: Vec<DVec3> = hands.iter().map(|hand| hand.with_z(0.05)).collect();
+        let wanted = WantedStep { hands: to.clone(), openings_m: vec![0.0; 2], blocks: &blocks };
+        let mut held_up = |holds: [bool; 2]| {
+            state.holds = holds.to_vec();
+            runner.step_waypoints(&to, &state, &wanted, [0.0; 2].into_iter()).unwrap().1
+        };
+        assert_eq!(held_up([true, false]), [false, true]);
+        assert_eq!(held_up([false, false]), [true, true]);
+    }
 }

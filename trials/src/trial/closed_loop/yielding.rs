@@ -17,7 +17,8 @@ const WITHDRAWAL_M: f64 = 0.006;
 const GRIP_EXCESS_M: f64 = 0.002;
 
 impl ClosedLoop<'_, '_> {
-    /// Continues from where the arms stopped on their way from `first`.
+    /// Continues from where the arms stopped on their way from `first`. Hands that hold an object that all arms share
+    /// keep their grip and do not withdraw.
     pub(super) fn yielded(&mut self, first: Waypoint) {
         let (mapping, state) = (&self.runner.mapping, &mut self.state);
         let forces_n = self.rig.forces_n();
@@ -26,12 +27,13 @@ impl ClosedLoop<'_, '_> {
             let opening_m = mapping.policy_opening_m(opening);
             // A gripper that holds something keeps its grip, unless its hand presses on something.
             let grips = state.openings_m[arm] < opening_m - GRIP_EXCESS_M;
-            if !grips || forces_n[arm].length() >= PRESSING_FORCE_N {
+            let presses = forces_n[arm].length() >= PRESSING_FORCE_N && !state.holds[arm];
+            if !grips || presses {
                 state.openings_m[arm] = opening_m;
             }
         }
         let withdraw = forces_n.into_iter().enumerate().map(|(arm, force_n)| {
-            if force_n.length() < PRESSING_FORCE_N {
+            if force_n.length() < PRESSING_FORCE_N || state.holds[arm] {
                 return DVec3::ZERO;
             }
             let yaw_rad = mapping.cell().arms[arm].yaw_rad;
