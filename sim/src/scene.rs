@@ -13,7 +13,7 @@ use crate::capsule::{ArmCapsules, LINK_FRAMES, LINK_RADII_M};
 use crate::frame::MAX_ARMS;
 use crate::hand::{WRIST_ABOVE_M, WRIST_RADIUS_M};
 use crate::kinematics::{ForwardKinematics, JointAngles};
-use crate::world::{PhysicsWorld as World, TABLE_HALF_M};
+use crate::world::{PhysicsWorld, TABLE_HALF_M};
 
 /// Iterations of the inverse kinematics from the joint angles at the start of a control step to the current hand
 /// position.
@@ -22,7 +22,7 @@ const ITERATIONS: usize = 20;
 /// Returns a snapshot of `world`, `time_s` after the start of the episode. `goal` has shape `[n_goal]`, arm frames; the
 /// objects are cubes with half edges `half_m`, or a bar.
 pub(crate) fn scene(
-    world: &World,
+    world: &PhysicsWorld,
     layout: Layout,
     goal: &[f32],
     half_m: f32,
@@ -69,7 +69,7 @@ fn bar_boxes(bar: &RigidBody) -> Vec<Cuboid> {
         .collect()
 }
 
-fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
+fn arm_scene(world: &PhysicsWorld, arm: &Arm) -> ArmScene {
     let end_effector = arm.hand.end_effector(&world.physics);
     let orientation = arm.hand.orientation(&world.physics);
     let (joint_angles_rad, joint_points, links) = match arm.mico_joints(&world.physics) {
@@ -101,7 +101,7 @@ fn arm_scene(world: &World, arm: &Arm) -> ArmScene {
 /// Returns the joint angles of a Jaco (radians), the positions of its joints, and its links and wrist, for the current
 /// position of its hand; world frame, metres.
 fn jaco_scene(
-    world: &World,
+    world: &PhysicsWorld,
     arm: &Arm,
     end_effector: Vector,
 ) -> (JointAngles, Vec<Vector>, Vec<Capsule>) {
