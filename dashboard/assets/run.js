@@ -215,7 +215,7 @@ function services(s) {
   const account = t.account ? `${count(t.spent)} of ${count(t.budget)} units charged, ${count(t.leased)} reserved for open episodes` : "no account yet";
   return [
     [teacher[0], "Teacher", teacher[1]],
-    [t.ledger_warning ? "bad" : t.state === "answering" ? "good" : "info", "Ledger", t.ledger_warning || (t.state === "answering" ? "writes every charge" : "state unknown")],
+    [t.warning ? "bad" : t.state === "answering" ? "good" : "info", "Policy and ledger", t.warning || (t.state === "answering" ? "work" : "state unknown")],
     ["info", "Account", account],
   ];
 }

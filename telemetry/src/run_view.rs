@@ -155,8 +155,8 @@ pub struct TeacherView {
     pub spent: u64,
     /// Units reserved for open episodes and not yet spent.
     pub leased: u64,
-    /// The reason why the ledger cannot be written; empty if it can.
-    pub ledger_warning: String,
+    /// The reason why the ledger cannot be written or the policy cannot be evaluated; empty if both can.
+    pub warning: String,
 }
 
 /// The result of the latest call to the teacher.

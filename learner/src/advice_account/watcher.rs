@@ -126,7 +126,7 @@ impl TeacherStatus {
         self.view.send_modify(|view| {
             (view.state, view.error) = (state, error);
             if let Ok(pb::Account { name, budget, spent, leased, warning, .. }) = answer {
-                (view.account, view.ledger_warning) = (name, warning);
+                (view.account, view.warning) = (name, warning);
                 (view.budget, view.spent, view.leased) = (budget, spent, leased);
             }
         });
