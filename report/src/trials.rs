@@ -156,7 +156,7 @@ impl TrialGroup {
     }
 }
 
-/// Returns true if a trial succeeded. A trial with a cause is a failure, whatever its other fields are.
+/// Returns true if a trial succeeded. A trial with a cause is a failure even if its other fields say otherwise.
 fn succeeded(row: &TrialRow) -> bool {
     row.success && row.cause.is_none()
 }

@@ -202,7 +202,7 @@ fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
     is_same_file || has_same_digest(copy, &teacher)
 }
 
-/// Returns true if two policy files have the same digest: their networks are equal, whatever else the files contain.
+/// Returns true if two policy files have the same digest: their networks are equal. Their other contents may differ.
 fn has_same_digest(one: &Path, other: &Path) -> bool {
     let [one, other] = [one, other].map(|path| Policy::load(path).ok());
     one.zip(other).is_some_and(|(one, other)| one.digest() == other.digest())

@@ -35,12 +35,12 @@ impl Swing {
         self.radps * (Self::CONSTANT_S + self.ramp_s())
     }
 
-    /// The smallest swing that is worth while, radians.
+    /// The smallest swing that is measured, radians.
     pub(super) fn least_rad(&self) -> f64 {
         0.02 * self.full_rad()
     }
 
-    /// Returns the motion from `state` in which the joint turns by `by` radians and nothing else moves.
+    /// Returns the motion from `state` that turns the joint by `by` radians and keeps the others where they are.
     pub(super) fn motion(&self, state: &PairState, by: f64) -> Motion {
         let (side, length) = (by.signum(), by.abs());
         // A short swing does not reach the speed.

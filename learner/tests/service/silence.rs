@@ -1,5 +1,6 @@
 //! Workers that die, and a learner whose own thread does.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -11,14 +12,19 @@ use tandem_proto::pb::next_work_response::Work;
 use crate::service_tests::run::{DEADLINE, Left, Served, calm, learner_config, real_clock};
 use crate::service_tests::toy::config;
 
+/// Serves a run in `directory` whose clock shows the returned number of seconds, from 0.
+async fn served_by_hand_clock(directory: &Path) -> (Served, Arc<AtomicU64>) {
+    let seconds = Arc::new(AtomicU64::new(0));
+    let clock = clock_of(&seconds);
+    let config = LearnerConfig { clock, ..learner_config(config(0), directory, false) };
+    (Served::start(config).await, seconds)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dead_workers_slot_is_played_by_another_within_seconds() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
-    let seconds = Arc::new(AtomicU64::new(0));
-    let clock = clock_of(&seconds);
-    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
-    let served = Served::start(config).await;
+    let (served, seconds) = served_by_hand_clock(directory.path()).await;
     let (mut dead, mut alive) = (served.join("dead").await, served.join("alive").await);
     let (lost, _) = dead.take().await.expect("a slot");
     for _ in 0..3 {
@@ -61,10 +67,7 @@ async fn a_disconnected_workers_slot_is_played_by_another_at_once() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     // The clock does not advance before the end, so no worker is slow or silent.
-    let seconds = Arc::new(AtomicU64::new(0));
-    let clock = clock_of(&seconds);
-    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
-    let served = Served::start(config).await;
+    let (served, seconds) = served_by_hand_clock(directory.path()).await;
     let (mut gone, mut alive) = (served.join("gone").await, served.join("alive").await);
     gone.take().await.expect("a slot");
     drop(gone);
@@ -81,10 +84,7 @@ async fn a_worker_that_disconnects_again_loses_its_slot_at_once_again() {
     let expected = calm(config(0)).await;
     let directory = tempfile::tempdir().expect("a directory");
     // The clock does not advance before the end, so no worker is slow or silent.
-    let seconds = Arc::new(AtomicU64::new(0));
-    let clock = clock_of(&seconds);
-    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
-    let served = Served::start(config).await;
+    let (served, seconds) = served_by_hand_clock(directory.path()).await;
     let (mut cut, mut alive) = (served.join("cut").await, served.join("alive").await);
     let (lost, _) = cut.take().await.expect("a slot");
     cut.client = served.client().await;
@@ -117,10 +117,7 @@ pub(crate) fn clock_of(seconds: &Arc<AtomicU64>) -> Clock {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_disconnected_worker_that_plays_beyond_the_end_receives_it() {
     let directory = tempfile::tempdir().expect("a directory");
-    let seconds = Arc::new(AtomicU64::new(0));
-    let clock = clock_of(&seconds);
-    let config = LearnerConfig { clock, ..learner_config(config(0), directory.path(), false) };
-    let served = Served::start(config).await;
+    let (served, seconds) = served_by_hand_clock(directory.path()).await;
     let (mut cut, mut other) = (served.join("cut").await, served.join("other").await);
     let mut leaving = served.join("leaving").await;
     let (order, episodes) = cut.take().await.expect("a slot");
