@@ -93,7 +93,7 @@ fn main() -> Result<(), AnyError> {
 /// Plays `n_episodes` of the policy in its world and measures how it moves its cubes.
 pub(crate) fn measure(policy: &Policy, n_episodes: u64) -> Result<Pushes, AnyError> {
     let actor = policy.actor()?;
-    let layout = policy.layout.as_built_in().ok_or("the policy is not for a built-in task")?;
+    let layout = policy.task.as_built_in().ok_or("the policy is not for a built-in task")?;
     let (world, n_threads) = (WorldConfig::default(), std::thread::available_parallelism());
     let n_threads = n_threads.unwrap_or(NonZeroUsize::MIN);
     let numbers = 0..n_episodes;
@@ -117,7 +117,7 @@ fn measure_episode(mut env: Env, episode: &Episode) -> Result<Pushes, AnyError> 
     for step_idx in 0..episode.n_steps() {
         env.step(episode.action(step_idx))?;
         let after = env.scene();
-        for arm in episode.layout.arms() {
+        for arm in episode.task.arms() {
             let (from, to) = (&before.objects[arm.0], &after.objects[arm.0]);
             let moved_m = distance(&from.centre, &to.centre);
             if moved_m > MOVES_M {

@@ -12,10 +12,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/policies");
     let policy = Policy::load(format!("{directory}/student-pick-and-place.safetensors").as_ref())?;
     let mut actor = policy.actor()?;
-    let layout = policy.layout.as_built_in().ok_or("a policy of a built-in task")?;
+    let layout = policy.task.as_built_in().ok_or("a policy of a built-in task")?;
     let mut env = Env::new(layout, &WorldConfig::default())?;
-    let mut observation = vec![0.0; policy.layout.n_observation()];
-    let mut action = vec![0.0; policy.layout.n_action()];
+    let mut observation = vec![0.0; policy.task.n_observation()];
+    let mut action = vec![0.0; policy.task.n_action()];
     let mut n_successes = 0;
     for episode in 0..20 {
         env.reset(&mut episode_rng(1, episode, Stream::Reset), WorldSettings::default());

@@ -70,7 +70,7 @@ fn eval_served(args: &EvalArgs) -> Result<(), Failed> {
         (None, None) => return Err(no_policy()),
     };
     let policy = policy_file::load(path)?;
-    check_required(args, &policy.layout, part)?;
+    check_required(args, &policy.task, part)?;
     let goals = (args.episodes, args.seed);
     let result = measure_served(&args.environment, (part, &policy), goals, &mut |_| {}, false)?;
     print(args, &result, &Baselines::none())

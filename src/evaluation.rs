@@ -50,11 +50,11 @@ impl EvaluatedPolicy {
         path: &Path,
     ) -> Result<Self, Failed> {
         let policy = simulated(policy, path)?;
-        if policy.layout.n_arms() != 1 {
+        if policy.task.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
                 path.display(),
-                policy.layout.n_arms()
+                policy.task.n_arms()
             )));
         }
         if !(1..=MAX_ARMS).contains(&n_arms) {
@@ -117,12 +117,12 @@ impl EvaluatedPolicy {
 
 /// Returns the layout of a policy that [`simulated`] has not refused.
 fn built_in(policy: &Policy) -> Layout {
-    policy.layout.as_built_in().expect("the constructors refuse policies of other tasks")
+    policy.task.as_built_in().expect("the constructors refuse policies of other tasks")
 }
 
 /// Refuses a policy of a task, or of a number of arms, that the simulator does not have.
 fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
-    match policy.layout.as_built_in() {
+    match policy.task.as_built_in() {
         Some(Layout { task, n_arms }) if (task.min_arms()..=MAX_ARMS).contains(&n_arms) => {
             Ok(policy)
         }
@@ -134,7 +134,7 @@ fn simulated(policy: Policy, path: &Path) -> Result<Policy, Failed> {
         None => Err(Failed::usage(format!(
             "{} is for task {:?}, which the simulator does not have: evaluate it with {}",
             path.display(),
-            policy.layout.name(),
+            policy.task.name(),
             evaluation_command(path)
         ))),
     }

@@ -240,7 +240,7 @@ impl Replayed {
         };
         let on_server = server.and_then(|server| {
             let server = server.lock().unwrap_or_else(PoisonError::into_inner);
-            (server.task == log.metadata.layout).then(|| server.replay(&log))
+            (server.task == log.metadata.task).then(|| server.replay(&log))
         });
         let outcome = on_server.unwrap_or_else(|| replay_log(&log));
         Self { file, outcome, cut_short: log.last_observation.is_none() }

@@ -159,7 +159,7 @@ fn baselines(args: &ReportArgs, runs: &[Run]) -> Result<Vec<Baseline>, Failed> {
     }
     for path in &args.composed_teachers {
         let teacher = policy_file::load(path)?;
-        for task in advised_tasks(runs, teacher.layout.name()) {
+        for task in advised_tasks(runs, teacher.task.name()) {
             let composed = EvaluatedPolicy::composed(teacher.clone(), (task, 2), path)?;
             let result = measure(&composed, (TEST_EPISODES, TEST_SEED), &mut |_| {})?;
             let label = format!("composed {}", stem(path));

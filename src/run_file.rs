@@ -167,7 +167,7 @@ fn shortened_interval(every_env_steps: u64, max_env_steps: u64) -> u64 {
 
 /// Returns whether the interval between evaluations is the one that follows from recipe and length.
 pub(crate) fn has_default_interval(config: &RunConfig) -> bool {
-    let Ok(task) = config.layout() else { return false };
+    let Ok(task) = config.task_spec() else { return false };
     let of_recipe = RunConfig::defaults_of(config.recipe, &task).evaluation;
     let default = shortened_interval(of_recipe.every_env_steps, config.stop.max_env_steps);
     config.evaluation.every_env_steps == default

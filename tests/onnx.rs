@@ -84,7 +84,7 @@ fn a_policy_comes_back_from_onnx_as_it_went() {
 fn a_policy_of_a_wide_task_goes_to_onnx() {
     let files = Files::new();
     let mut policy = Policy::load(Path::new(TEACHER)).expect("shipped");
-    let mut description = policy.layout.description().clone();
+    let mut description = policy.task.description().clone();
     description.name = "lab/wide".to_owned();
     description.reflection = Reflection::default();
     let n_added = 1100 - description.n_observation;
@@ -102,13 +102,13 @@ fn a_policy_of_a_wide_task_goes_to_onnx() {
         wide.extend(&parameters[shape.weight(0).end..]);
         wide
     };
-    let n_goal = policy.layout.n_goal();
+    let n_goal = policy.task.n_goal();
     policy.actor = widened(policy.actor_shape(), &policy.actor, n_goal);
-    let n_rest = n_goal + policy.layout.n_action();
+    let n_rest = n_goal + policy.task.n_action();
     policy.critic = widened(policy.critic_shape(), &policy.critic, n_rest);
     policy.observation_normalizer.mean.resize(1100, 0.0);
     policy.observation_normalizer.std.resize(1100, 1.0);
-    policy.layout = TaskSpec::new(description).expect("consistent");
+    policy.task = TaskSpec::new(description).expect("consistent");
     let wide = files.name("wide.safetensors");
     policy.save(Path::new(&wide)).expect("valid");
 

@@ -18,7 +18,7 @@ const N_EPISODES: u64 = 100;
 fn check(name: &str) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("policies").join(name);
     let policy = Policy::load(&path).expect("ships");
-    let world = policy.layout.as_built_in().expect("a built-in task").task.world();
+    let world = policy.task.as_built_in().expect("a built-in task").task.world();
     let pushes = pushes::measure(&policy, N_EPISODES).expect("plays");
     let (above, gliding) = (pushes.share_above(), pushes.share_gliding());
     assert!(pushes.success >= 0.95, "{name}: success {}", pushes.success);

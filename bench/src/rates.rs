@@ -68,11 +68,11 @@ pub fn inference(clock: &Clock) -> Result<Vec<Figure>, Error> {
     let trainer = Trainer::new(config)?;
     let policy = trainer.policy(std::collections::BTreeMap::new());
     let mut actor = policy.actor()?;
-    let layout = policy.layout;
+    let task = policy.task;
     let mut decision_us = |n: usize| {
         let (observations, goals) =
-            (vec![0.1; n * layout.n_observation()], vec![0.1; n * layout.n_goal()]);
-        let mut actions = vec![0.0; n * layout.n_action()];
+            (vec![0.1; n * task.n_observation()], vec![0.1; n * task.n_goal()]);
+        let mut actions = vec![0.0; n * task.n_action()];
         1e6 / rate(clock, || actor.act(&observations, &goals, &mut actions))
     };
     let [one, two, eight] = [1, 2, 8].map(&mut decision_us);

@@ -100,7 +100,7 @@ pub struct Episode {
     /// Version of the policy's parameters.
     pub parameter_version: u64,
     /// The task, which determines the length of every vector below.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// Observations before each step and after the last one, shape `[n + 1, n_observation]`.
     pub observations: Vec<f32>,
     /// Desired goal, shape `[n_goal]`.
@@ -125,29 +125,29 @@ pub struct Episode {
 impl Episode {
     /// Returns a training episode in which every number is zero, to be filled in.
     #[must_use]
-    pub fn zeros(layout: impl Into<TaskSpec>, number: u64) -> Self {
-        let layout = layout.into();
-        let n_steps = layout.episode_steps();
+    pub fn zeros(task: impl Into<TaskSpec>, number: u64) -> Self {
+        let task = task.into();
+        let n_steps = task.episode_steps();
         Self {
             number,
             kind: EpisodeKind::Training,
             parameter_version: 0,
-            observations: vec![0.0; (n_steps + 1) * layout.n_observation()],
-            goal: vec![0.0; layout.n_goal()],
-            actions: vec![0.0; n_steps * layout.n_action()],
+            observations: vec![0.0; (n_steps + 1) * task.n_observation()],
+            goal: vec![0.0; task.n_goal()],
+            actions: vec![0.0; n_steps * task.n_action()],
             advised_arms: vec![0; n_steps],
             contacts: vec![Contacts::NONE; n_steps],
             advice_charged: 0,
             avoidance_steps: None,
             queried_steps: None,
-            layout,
+            task,
         }
     }
 
     /// Returns the number of control steps.
     #[must_use]
     pub fn n_steps(&self) -> usize {
-        self.layout.episode_steps()
+        self.task.episode_steps()
     }
 
     /// Returns the observation before step `step_idx`, shape `[n_observation]`; `n_steps` gives the final one.
@@ -156,7 +156,7 @@ impl Episode {
     /// If `step_idx` exceeds the number of steps.
     #[must_use]
     pub fn observation(&self, step_idx: usize) -> &[f32] {
-        let n = self.layout.n_observation();
+        let n = self.task.n_observation();
         &self.observations[step_idx * n..(step_idx + 1) * n]
     }
 
@@ -166,7 +166,7 @@ impl Episode {
     /// If `step_idx` is not below the number of steps.
     #[must_use]
     pub fn action(&self, step_idx: usize) -> &[f32] {
-        let n = self.layout.n_action();
+        let n = self.task.n_action();
         &self.actions[step_idx * n..(step_idx + 1) * n]
     }
 
@@ -176,7 +176,7 @@ impl Episode {
     /// If `step_idx` exceeds the number of steps, or there is no such arm.
     #[must_use]
     pub fn achieved(&self, step_idx: usize, arm: ArmIndex) -> Cow<'_, [f32]> {
-        self.layout.achieved_goal_of(arm).of(self.observation(step_idx))
+        self.task.achieved_goal_of(arm).of(self.observation(step_idx))
     }
 
     /// Returns the observation after the last step, shape `[n_observation]`.
@@ -188,13 +188,13 @@ impl Episode {
     /// Returns `true` if `arm` succeeds after each of the last [steps](TaskSpec::success_steps) that count.
     #[must_use]
     pub fn arm_succeeded(&self, arm: ArmIndex) -> bool {
-        self.ends_with(|observation| self.layout.arm_succeeds(arm, observation, &self.goal))
+        self.ends_with(|observation| self.task.arm_succeeds(arm, observation, &self.goal))
     }
 
     /// Returns `true` if every arm succeeds after each of the last [steps](TaskSpec::success_steps) that count.
     #[must_use]
     pub fn succeeded(&self) -> bool {
-        self.ends_with(|observation| self.layout.is_success(observation, &self.goal))
+        self.ends_with(|observation| self.task.is_success(observation, &self.goal))
     }
 
     /// Returns `true` if every arm succeeds after as many consecutive steps as [count](TaskSpec::success_steps), and
@@ -203,16 +203,16 @@ impl Episode {
     pub fn lost_goal(&self) -> bool {
         let mut n_succeeding = 0;
         let succeeded_before = (1..=self.n_steps()).any(|step_idx| {
-            let succeeds = self.layout.is_success(self.observation(step_idx), &self.goal);
+            let succeeds = self.task.is_success(self.observation(step_idx), &self.goal);
             n_succeeding = if succeeds { n_succeeding + 1 } else { 0 };
-            n_succeeding == self.layout.success_steps()
+            n_succeeding == self.task.success_steps()
         });
         succeeded_before && !self.succeeded()
     }
 
     fn ends_with(&self, succeeds: impl Fn(&[f32]) -> bool) -> bool {
         let n_steps = self.n_steps();
-        let first = n_steps + 1 - self.layout.success_steps();
+        let first = n_steps + 1 - self.task.success_steps();
         (first..=n_steps).all(|step_idx| succeeds(self.observation(step_idx)))
     }
 
@@ -230,16 +230,15 @@ impl Episode {
     /// If `step_idx` is not below the number of steps.
     #[must_use]
     pub fn joint_reward(&self, step_idx: usize) -> f32 {
-        let achieved: Vec<f32> =
-            self.layout.achieved_goal(self.observation(step_idx + 1)).collect();
-        self.layout.sparse_reward(&achieved, &self.goal)
+        let achieved: Vec<f32> = self.task.achieved_goal(self.observation(step_idx + 1)).collect();
+        self.task.sparse_reward(&achieved, &self.goal)
     }
 
     /// Returns `true` if what any arm, or all arms together, achieved differs by more than the task's tolerance between
     /// the start and the end: in the built-in tasks, if an object ended more than 5 cm from where it was.
     #[must_use]
     pub fn moved(&self) -> bool {
-        self.layout.is_displaced(self.observation(0), self.last_observation())
+        self.task.is_displaced(self.observation(0), self.last_observation())
     }
 }
 

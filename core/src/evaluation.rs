@@ -40,14 +40,14 @@ impl EpisodeOutcome {
         let collided = episode.contacts.iter().any(|contacts| contacts.any());
         let has = |contact: Contacts| {
             let mut contacts = episode.contacts.iter();
-            episode.layout.reports_contacts().then(|| contacts.any(|each| each.contains(contact)))
+            episode.task.reports_contacts().then(|| contacts.any(|each| each.contains(contact)))
         };
         let settled_after = steps_until_settled(episode);
         let first_contact = episode.contacts.iter().position(|contacts: &Contacts| contacts.any());
         Self {
             success: episode.succeeded(),
             success_joint: episode.succeeded_jointly(),
-            success_per_arm: episode.layout.arms().map(|arm| episode.arm_succeeded(arm)).collect(),
+            success_per_arm: episode.task.arms().map(|arm| episode.arm_succeeded(arm)).collect(),
             arm_contact: has(Contacts::ARM_ARM),
             table_contact: has(Contacts::ARM_TABLE),
             avoidance: episode.avoidance_steps.map(|n_steps| n_steps > 0),
@@ -72,8 +72,7 @@ impl EpisodeOutcome {
 /// Returns the number of steps after which every object stays within the tolerance of its goal, the episode's steps if that
 /// never happens.
 fn steps_until_settled(episode: &Episode) -> usize {
-    let at_goal =
-        |step_idx| episode.layout.is_success(episode.observation(step_idx), &episode.goal);
+    let at_goal = |step_idx| episode.task.is_success(episode.observation(step_idx), &episode.goal);
     (0..episode.n_steps())
         .rev()
         .find(|step_idx| !at_goal(step_idx + 1))
@@ -157,7 +156,7 @@ impl EvaluationSummary {
         Wilson::of((share * self.n_episodes as f64).round() as usize, self.n_episodes)
     }
 
-    /// Summarises `outcomes`, which belong to one layout. Without outcomes all rates are 0.
+    /// Summarises `outcomes`, which belong to one task. Without outcomes all rates are 0.
     #[must_use]
     pub fn of(outcomes: &[EpisodeOutcome]) -> Self {
         let n = outcomes.len().max(1) as f64;

@@ -116,7 +116,7 @@
 //!     number: 0,
 //!     kind: EpisodeKind::Evaluation,
 //!     parameter_version: 0,
-//!     layout: layout.into(),
+//!     task: layout.into(),
 //!     observations: vec![0.0; (EPISODE_STEPS + 1) * layout.n_observation()],
 //!     goal: vec![0.0, 0.0, 0.02],
 //!     actions: vec![0.0; EPISODE_STEPS * layout.n_action()],

@@ -10,7 +10,7 @@ pub struct RunTerms {
     /// The run's name; empty outside a run.
     pub run: String,
     /// The task.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// The account at the teacher; `None` if the run takes no advice.
     pub account: Option<String>,
     /// Terms on which the student asks for advice.

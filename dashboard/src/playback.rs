@@ -57,7 +57,7 @@ impl Playback {
     /// Returns the episodes; `None` if there are none, or their goals are no points.
     pub(crate) fn of(episodes: &[Episode]) -> Option<Self> {
         let first = episodes.first()?;
-        let task = &first.layout;
+        let task = &first.task;
         let parts = parts(task);
         if parts.is_empty() {
             return None;
@@ -102,7 +102,7 @@ fn bases(layout: Layout) -> Vec<Point> {
 }
 
 fn played(episode: &Episode, parts: &[GoalPart]) -> PlayedEpisode {
-    let task = &episode.layout;
+    let task = &episode.task;
     let state = |step_idx: usize| {
         let observation = episode.observation(step_idx);
         parts.iter().map(|part| part_state(task, *part, observation, &episode.goal)).collect()

@@ -14,8 +14,8 @@ const SEED: u64 = 2;
 
 /// Returns the task of a policy that the simulator can play.
 pub(crate) fn built_in(policy: &Policy) -> Result<Layout, Error> {
-    let not_built_in = || Error::NotBuiltIn(policy.layout.name().to_owned());
-    policy.layout.as_built_in().ok_or_else(not_built_in)
+    let not_built_in = || Error::NotBuiltIn(policy.task.name().to_owned());
+    policy.task.as_built_in().ok_or_else(not_built_in)
 }
 
 /// A world, the policy that acts in it, and the goals.

@@ -148,7 +148,7 @@ impl Page {
     /// As [`digest`], and if no policy is loaded.
     pub fn digest(&self) -> Result<Value, Error> {
         let (policy, _) = self.live.as_ref().ok_or(Error::NothingLoaded)?;
-        Ok(json!({ "task": policy.layout.name(), "digest": digest(policy)? }))
+        Ok(json!({ "task": policy.task.name(), "digest": digest(policy)? }))
     }
 
     fn scene(&self, position: Option<f64>) -> Result<Scene, Error> {

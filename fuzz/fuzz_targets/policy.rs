@@ -9,10 +9,10 @@ fuzz_target!(|file: &[u8]| {
     let path = scratch_file("policy.safetensors");
     write(&path, file);
     let Ok(policy) = with_bounded_memory(|| Policy::load(&path)) else { return };
-    let layout = policy.layout.clone();
+    let task = policy.task.clone();
     let mut actor = policy.actor().expect("a policy that was loaded can act");
-    let mut action = vec![f32::NAN; layout.n_action()];
-    actor.act(&vec![0.5; layout.n_observation()], &vec![-0.5; layout.n_goal()], &mut action);
+    let mut action = vec![f32::NAN; task.n_action()];
+    actor.act(&vec![0.5; task.n_observation()], &vec![-0.5; task.n_goal()], &mut action);
     policy.critic().expect("a policy that was loaded values actions");
     policy.save(&path).expect("a policy that was loaded can be saved");
     assert_eq!(Policy::load(&path).expect("a saved policy can be loaded"), policy);

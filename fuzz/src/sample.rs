@@ -34,7 +34,7 @@ pub fn trainer(n_rounds: u64) -> Trainer {
     trainer
 }
 
-/// The layout of [`run_config`]'s task.
+/// The task of [`run_config`] and its number of arms.
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
 /// Returns a made-up episode of [`run_config`]'s task.
@@ -44,7 +44,7 @@ pub fn episode(number: u64) -> Episode {
         number,
         kind: EpisodeKind::Training,
         parameter_version: 0,
-        layout: layout.into(),
+        task: layout.into(),
         observations: vec![0.25; (EPISODE_STEPS + 1) * layout.n_observation()],
         goal: vec![0.5; layout.n_goal()],
         actions: vec![-0.5; EPISODE_STEPS * layout.n_action()],
@@ -100,7 +100,7 @@ fn metadata(layout: Layout) -> EpisodeMetadata {
         seed: 1,
         kind: EpisodeKind::Evaluation,
         parameter_version: 3,
-        layout: layout.into(),
+        task: layout.into(),
         policy_digest: "5f3a".to_owned(),
         world: BTreeMap::from([("substeps".to_owned(), "20".to_owned())]),
     }

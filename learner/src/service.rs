@@ -407,7 +407,7 @@ impl LearnerService {
         let mut state = self.shared.lock();
         let terms =
             state.terms.as_ref().ok_or_else(|| Status::unavailable("the run is starting"))?;
-        let layout = terms.layout.clone();
+        let task = terms.task.clone();
         let worker = state.queue.worker(worker_id).map(|worker| (worker_id, worker.name.clone()));
         let refused = |error| refusal(&error, worker.as_ref());
         let Some(order) = state.queue.order_of(worker_id, slot, now).map_err(refused)? else {
@@ -418,7 +418,7 @@ impl LearnerService {
         drop(state);
         let decode = |episode: pb::Episode| {
             let number = episode.number;
-            decode_episode(episode, &layout)
+            decode_episode(episode, &task)
                 .map_err(|error| malformed(&error, number, worker.as_ref()))
         };
         let episodes: Vec<Episode> = episodes.into_iter().map(decode).collect::<Result<_, _>>()?;

@@ -228,7 +228,7 @@ impl LearnerLoop<'_> {
         let orders = self.trainer.training_orders(round, version);
         if let Some(account) = &mut self.account {
             let payers = payers(&orders, self.context.config.run.advice.unit);
-            let units = units_per_episode(&orders, &self.trainer.layout);
+            let units = units_per_episode(&orders, &self.trainer.task);
             let allowances = account.open_leases(payers, units, spent)?;
             let allowances = allowances.iter().map(|each| (each.episode, each.units));
             self.context.shared.lock().queue.limit_claims(allowances);

@@ -1,4 +1,4 @@
-//! Networks bound to the vectors of a layout.
+//! Networks bound to the vectors of a task.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -12,7 +12,7 @@ use crate::metadata;
 use crate::model::Model;
 use crate::network::{Input, Network};
 
-/// Largest number of arms that [`layout_of`] considers.
+/// Largest number of arms that [`task_of`] considers.
 const MAX_ARMS: usize = 8;
 
 /// The function that a network computes.
@@ -24,7 +24,7 @@ pub enum Role {
     Critic,
 }
 
-/// The origin of a column of a network. The number is an index in a row of the layout's vector.
+/// The origin of a column of a network. The number is an index in that vector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Source {
     /// A number of the observation.
@@ -35,12 +35,12 @@ pub enum Source {
     Action(usize),
 }
 
-/// A network whose inputs are the vectors of a layout.
+/// A network whose inputs are the vectors of a task.
 ///
 /// The result for a row has the same bits in any batch and on every machine.
 #[derive(Debug, Clone)]
 pub struct BoundNetwork {
-    layout: TaskSpec,
+    task: TaskSpec,
     network: Network,
     /// Source of each of the network's columns.
     sources: Vec<Source>,
@@ -49,7 +49,7 @@ pub struct BoundNetwork {
 }
 
 impl BoundNetwork {
-    /// Binds the network of `model` to `layout`.
+    /// Binds the network of `model` to `task`.
     ///
     /// Inputs are recognised by their names: `observation` (or `obs`, `state`), `goal` (or `desired_goal`),
     /// `achieved_goal`, which is a part of the observation, and `action` (or `actions`). A model with one input, or
@@ -58,33 +58,33 @@ impl BoundNetwork {
     ///
     /// # Errors
     /// When an input has another name or length, or an actor's output is not as long as an action.
-    pub fn new(model: &Model, role: Role, layout: impl Into<TaskSpec>) -> Result<Self, ModelError> {
-        let (network, layout) = (&model.network, layout.into());
-        if role == Role::Actor && network.n_output != layout.n_action() {
+    pub fn new(model: &Model, role: Role, task: impl Into<TaskSpec>) -> Result<Self, ModelError> {
+        let (network, task) = (&model.network, task.into());
+        if role == Role::Actor && network.n_output != task.n_action() {
             return Err(ModelError::Value {
                 kind: "output",
                 name: network.output.clone(),
                 problem: format!(
                     "it has {} numbers, an action of {} with {} has {}",
                     network.n_output,
-                    layout.name(),
-                    counted(layout.n_arms(), "arm"),
-                    layout.n_action()
+                    task.name(),
+                    counted(task.n_arms(), "arm"),
+                    task.n_action()
                 ),
             });
         }
         let is_only = network.inputs.len() == 1;
-        let inputs = network.inputs.iter().map(|input| sources(input, is_only, role, &layout));
+        let inputs = network.inputs.iter().map(|input| sources(input, is_only, role, &task));
         let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
         let sources = network.columns.iter().map(|column| inputs[column.input][column.index]);
         let sources = sources.collect();
-        Ok(Self { layout, network: network.clone(), sources, row: Vec::new(), scratch: Vec::new() })
+        Ok(Self { task, network: network.clone(), sources, row: Vec::new(), scratch: Vec::new() })
     }
 
-    /// Returns the layout.
+    /// Returns the task.
     #[must_use]
-    pub const fn layout(&self) -> &TaskSpec {
-        &self.layout
+    pub const fn task(&self) -> &TaskSpec {
+        &self.task
     }
 
     /// Returns the network.
@@ -103,7 +103,7 @@ impl BoundNetwork {
     /// `[n, n_goal]`, and `actions`, shape `[n, n_action]`, or empty for an actor.
     ///
     /// # Panics
-    /// If the lengths do not match the layout or each other.
+    /// If the lengths do not match the task or each other.
     pub fn run(
         &mut self,
         observations: &[f32],
@@ -111,14 +111,14 @@ impl BoundNetwork {
         actions: &[f32],
         outputs: &mut [f32],
     ) {
-        let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());
-        let (n_action, n_output) = (self.layout.n_action(), self.network.n_output);
+        let (n_observation, n_goal) = (self.task.n_observation(), self.task.n_goal());
+        let (n_action, n_output) = (self.task.n_action(), self.network.n_output);
         let n_rows = observations.len() / n_observation;
         let n_actions = if actions.is_empty() { 0 } else { n_rows * n_action };
         assert_eq!(
             (observations.len(), goals.len(), actions.len(), outputs.len()),
             (n_rows * n_observation, n_rows * n_goal, n_actions, n_rows * n_output),
-            "rows of another layout"
+            "rows of another task"
         );
         for (row, output) in outputs.chunks_exact_mut(n_output).enumerate() {
             let number = |source: &Source| match *source {
@@ -135,13 +135,13 @@ impl BoundNetwork {
     }
 }
 
-/// Returns the layout of `model`: the one in its metadata, or the only one of the classic world whose vectors fit.
+/// Returns the task of `model`: the one in its metadata, or the only one of the classic world whose vectors fit.
 ///
 /// # Errors
-/// When no layout fits, or several do.
-pub fn layout_of(model: &Model, role: Role) -> Result<TaskSpec, ModelError> {
-    if let Some(layout) = layout_in_metadata(&model.metadata)? {
-        return Ok(layout);
+/// When no task fits, or several do.
+pub fn task_of(model: &Model, role: Role) -> Result<TaskSpec, ModelError> {
+    if let Some(task) = task_in_metadata(&model.metadata)? {
+        return Ok(task);
     }
     let candidates = Task::CLASSIC
         .into_iter()
@@ -168,13 +168,12 @@ pub fn layout_of(model: &Model, role: Role) -> Result<TaskSpec, ModelError> {
 /// # Errors
 /// When they are for different tasks, or parts of different policies.
 pub fn check_pair(actor: &Model, critic: &Model) -> Result<(), ModelError> {
-    let layout = |model: &Model| layout_in_metadata(&model.metadata).ok().flatten();
-    if let (Some(of_actor), Some(of_critic)) = (layout(actor), layout(critic))
+    let task = |model: &Model| task_in_metadata(&model.metadata).ok().flatten();
+    if let (Some(of_actor), Some(of_critic)) = (task(actor), task(critic))
         && of_actor != of_critic
     {
-        let text = |layout: &TaskSpec| {
-            format!("{} with {}", layout.name(), counted(layout.n_arms(), "arm"))
-        };
+        let text =
+            |task: &TaskSpec| format!("{} with {}", task.name(), counted(task.n_arms(), "arm"));
         let (actor, critic) = (text(&of_actor), text(&of_critic));
         let problem = match actor == critic {
             false => format!("its metadata says {critic}, the actor's says {actor}"),
@@ -202,7 +201,7 @@ pub fn names_task(model: &Model) -> bool {
         .any(|key| model.metadata.contains_key(*key))
 }
 
-fn layout_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<TaskSpec>, ModelError> {
+fn task_in_metadata(entries: &BTreeMap<String, String>) -> Result<Option<TaskSpec>, ModelError> {
     let refused = |key: &str, value: &str, expected: String| {
         let value = tandem_core::text::shortened(value, 80);
         ModelError::Model(format!("metadata {key:?} is {value:?}, expected {expected}"))
@@ -239,12 +238,12 @@ fn sources(
     input: &Input,
     is_only: bool,
     role: Role,
-    layout: &TaskSpec,
+    task: &TaskSpec,
 ) -> Result<Vec<Source>, ModelError> {
-    let observation = || (0..layout.n_observation()).map(Source::Observation);
-    let goal = || (0..layout.n_goal()).map(Source::Goal);
-    let action = || (0..layout.n_action()).map(Source::Action);
-    let achieved = || layout.description().achieved_goal.iter().copied();
+    let observation = || (0..task.n_observation()).map(Source::Observation);
+    let goal = || (0..task.n_goal()).map(Source::Goal);
+    let action = || (0..task.n_action()).map(Source::Action);
+    let achieved = || task.description().achieved_goal.iter().copied();
     let has_action = role == Role::Critic;
     let mut candidates: Vec<Vec<Source>> = Vec::new();
     let name = input.name.to_ascii_lowercase();
@@ -275,19 +274,15 @@ fn sources(
         refused(format!(
             "it has {} numbers, {} with {} has {}",
             input.width,
-            layout.name(),
-            counted(layout.n_arms(), "arm"),
+            task.name(),
+            counted(task.n_arms(), "arm"),
             lengths.join(" or ")
         ))
     })
 }
 
 /// Returns the range of the observation, then of the goal and of the action, in an input row of a policy's network.
-pub(crate) fn policy_columns(layout: &TaskSpec) -> [Range<usize>; 3] {
-    let n_state = layout.n_observation() + layout.n_goal();
-    [
-        0..layout.n_observation(),
-        layout.n_observation()..n_state,
-        n_state..n_state + layout.n_action(),
-    ]
+pub(crate) fn policy_columns(task: &TaskSpec) -> [Range<usize>; 3] {
+    let n_state = task.n_observation() + task.n_goal();
+    [0..task.n_observation(), task.n_observation()..n_state, n_state..n_state + task.n_action()]
 }

@@ -60,7 +60,7 @@ pub enum ModelError {
         /// The property that is not supported, and the supported ones.
         problem: String,
     },
-    /// An input or output of the model does not fit the layout or the role.
+    /// An input or output of the model does not fit the task or the role.
     #[error("{kind} {name:?}: {problem}")]
     Value {
         /// `input` or `output`.

@@ -35,7 +35,7 @@ pub fn actor(policy: &Policy) -> Result<Vec<u8>, Error> {
     let input = graph.concat(&state);
     let raw = graph.network(&policy.actor_shape(), &policy.actor, input);
     graph.node("Tanh", &[&raw], "action", &[]);
-    graph.add_output("action", policy.layout.n_action());
+    graph.add_output("action", policy.task.n_action());
     Ok(graph.into_file(policy))
 }
 
@@ -48,7 +48,7 @@ pub fn critic(policy: &Policy) -> Result<Vec<u8>, Error> {
     policy.check()?;
     let mut graph = Graph::new("critic");
     let mut inputs = vec![graph.observation(policy), graph.goal(policy)];
-    graph.add_input("action", policy.layout.n_action());
+    graph.add_input("action", policy.task.n_action());
     inputs.push("action".to_owned());
     let input = graph.concat(&inputs);
     let raw = graph.network(&policy.critic_shape(), &policy.critic, input);

@@ -30,38 +30,35 @@ const MAX_PARAMETERS: usize = 1 << 24;
 /// The metadata that [`export`](crate::export) wrote is restored if the policy is still the exported one.
 ///
 /// # Errors
-/// When a model does not fit `layout`, or a policy file cannot represent it.
+/// When a model does not fit `task`, or a policy file cannot represent it.
 pub fn import(
     actor: &Model,
     critic: Option<&Model>,
-    layout: impl Into<TaskSpec>,
+    task: impl Into<TaskSpec>,
 ) -> Result<Policy, ModelError> {
-    let layout = &layout.into();
-    let actor_network =
-        Converted::new(&BoundNetwork::new(actor, Role::Actor, layout)?, Role::Actor)?;
+    let task = &task.into();
+    let actor_network = Converted::new(&BoundNetwork::new(actor, Role::Actor, task)?, Role::Actor)?;
     let critic_network = critic
-        .map(|critic| {
-            Converted::new(&BoundNetwork::new(critic, Role::Critic, layout)?, Role::Critic)
-        })
+        .map(|critic| Converted::new(&BoundNetwork::new(critic, Role::Critic, task)?, Role::Critic))
         .transpose()?;
     let n_heads = critic_network.as_ref().map_or(1, |critic| critic.n_output());
-    check_heads(n_heads, layout)?;
+    check_heads(n_heads, task)?;
     let both = || [Some(&actor_network), critic_network.as_ref()].into_iter().flatten();
     let n_hidden = both().map(Converted::widest).max().unwrap_or(1);
     let n_hidden_layers = both().map(|network| network.layers.len() - 1).max().unwrap_or(1);
-    let [observation, goal, _] = policy_columns(layout);
-    let normalizers = shared_normalizers(layout, both())?;
-    let critic_shape = MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads);
-    let actor_shape = MlpShape::actor(layout, n_hidden, n_hidden_layers);
+    let [observation, goal, _] = policy_columns(task);
+    let normalizers = shared_normalizers(task, both())?;
+    let critic_shape = MlpShape::critic(task, n_hidden, n_hidden_layers, n_heads);
+    let actor_shape = MlpShape::actor(task, n_hidden, n_hidden_layers);
     check_size(n_hidden_layers, &[actor_shape, critic_shape])?;
     let mut policy = Policy {
-        layout: layout.clone(),
+        task: task.clone(),
         n_hidden,
         n_hidden_layers,
         n_heads,
-        actor: actor_network.parameters(layout, &actor_shape),
+        actor: actor_network.parameters(task, &actor_shape),
         critic: match &critic_network {
-            Some(critic) => critic.parameters(layout, &critic_shape),
+            Some(critic) => critic.parameters(task, &critic_shape),
             None => vec![0.0; critic_shape.n_parameters()],
         },
         observation_normalizer: snapshot(&normalizers[observation]),
@@ -73,27 +70,27 @@ pub fn import(
     Ok(policy)
 }
 
-/// Checks that the network of one model fits `layout` and that a policy file can represent it, so that an error of
+/// Checks that the network of one model fits `task` and that a policy file can represent it, so that an error of
 /// [`import`] concerns both models.
 ///
 /// # Errors
 /// When the network does not fit, or a policy file cannot represent it.
-pub fn check(model: &Model, role: Role, layout: &TaskSpec) -> Result<(), ModelError> {
-    let network = Converted::new(&BoundNetwork::new(model, role, layout)?, role)?;
+pub fn check(model: &Model, role: Role, task: &TaskSpec) -> Result<(), ModelError> {
+    let network = Converted::new(&BoundNetwork::new(model, role, task)?, role)?;
     match role {
         Role::Actor => Ok(()),
-        Role::Critic => check_heads(network.n_output(), layout),
+        Role::Critic => check_heads(network.n_output(), task),
     }
 }
 
 /// Refuses a critic with neither one value nor one for each arm.
-fn check_heads(n_heads: usize, layout: &TaskSpec) -> Result<(), ModelError> {
-    if [1, layout.n_arms()].contains(&n_heads) {
+fn check_heads(n_heads: usize, task: &TaskSpec) -> Result<(), ModelError> {
+    if [1, task.n_arms()].contains(&n_heads) {
         return Ok(());
     }
     Err(ModelError::NotRepresentable(format!(
         "its critic has {n_heads} values, expected 1, or one for each of {}",
-        counted(layout.n_arms(), "arm")
+        counted(task.n_arms(), "arm")
     )))
 }
 
@@ -148,8 +145,8 @@ impl Converted {
         let sources = network.sources().iter().copied();
         let columns = sources.zip(&network.network().columns).map(|(source, column)| {
             let bound = match source {
-                Source::Observation(i) => network.layout().observation_bound(i),
-                Source::Goal(i) => network.layout().goal_bound(i),
+                Source::Observation(i) => network.task().observation_bound(i),
+                Source::Goal(i) => network.task().goal_bound(i),
                 Source::Action(_) => 1.0,
             };
             Ok((source, normalized(source, column, bound).map_err(ModelError::NotRepresentable)?))
@@ -169,7 +166,7 @@ impl Converted {
     }
 
     /// Returns the parameters of the same network with shape `shape`.
-    fn parameters(&self, layout: &TaskSpec, shape: &MlpShape) -> Vec<f32> {
+    fn parameters(&self, task: &TaskSpec, shape: &MlpShape) -> Vec<f32> {
         let mut parameters = vec![0.0; shape.n_parameters()];
         let n_missing = shape.n_layers() - self.layers.len();
         for layer in 0..shape.n_layers() {
@@ -186,7 +183,7 @@ impl Converted {
             let source = &self.layers[if is_output { layer - n_missing } else { layer }];
             let matrix = &mut parameters[weight];
             if layer == 0 {
-                self.write_first(source, layout, matrix, n_in);
+                self.write_first(source, task, matrix, n_in);
             } else {
                 for (unit, weights) in source.rows().enumerate() {
                     matrix[unit * n_in..][..weights.len()].copy_from_slice(&weights);
@@ -203,8 +200,8 @@ impl Converted {
 
     /// Writes the first layer's weights to the columns of a policy's network. Columns of the same source add up.
     #[expect(clippy::cast_possible_truncation, reason = "weights are stored as f32")]
-    fn write_first(&self, layer: &Dense, layout: &TaskSpec, matrix: &mut [f32], n_in: usize) {
-        let [observation, goal, action] = policy_columns(layout);
+    fn write_first(&self, layer: &Dense, task: &TaskSpec, matrix: &mut [f32], n_in: usize) {
+        let [observation, goal, action] = policy_columns(task);
         let position = |source| match source {
             Source::Observation(i) => observation.start + i,
             Source::Goal(i) => goal.start + i,
@@ -235,10 +232,10 @@ impl Converted {
 /// Returns mean and standard deviation of each number of observation and goal, on which all networks must agree. Numbers
 /// that no network uses are not normalised.
 fn shared_normalizers<'a>(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     networks: impl Iterator<Item = &'a Converted>,
 ) -> Result<Vec<[f32; 2]>, ModelError> {
-    let [observation, goal, _] = policy_columns(layout);
+    let [observation, goal, _] = policy_columns(task);
     let mut normalizers = vec![None; goal.end];
     for (source, column) in networks.flat_map(|network| &network.columns) {
         let (at, name) = match source {

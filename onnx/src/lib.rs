@@ -17,7 +17,7 @@
 //! let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../policies/teacher-push-classic.safetensors");
 //! let policy = Policy::load(path.as_ref())?;
 //! let model = Model::decode(&export::actor(&policy)?)?;
-//! let mut actor = BoundNetwork::new(&model, Role::Actor, &policy.layout)?;
+//! let mut actor = BoundNetwork::new(&model, Role::Actor, &policy.task)?;
 //!
 //! let (observation, goal) = ([0.0; 28], [0.1, 0.0, 0.02]);
 //! let (mut action, mut expected) = ([0.0; 3], [0.0; 3]);

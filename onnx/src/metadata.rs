@@ -45,7 +45,7 @@ const ACTION: [Part; 2] =
 /// Returns the entries that describe `policy`.
 #[must_use]
 pub fn of(policy: &Policy) -> BTreeMap<String, String> {
-    let task = &policy.layout;
+    let task = &policy.task;
     let mut entries: BTreeMap<&str, String> = BTreeMap::from([
         (TASK, task.name().to_owned()),
         (N_ARMS, task.n_arms().to_string()),

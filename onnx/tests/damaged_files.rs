@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use tandem_onnx::binding::layout_of;
+use tandem_onnx::binding::task_of;
 use tandem_onnx::{BoundNetwork, Model, Role, import};
 
 fn file(name: &str) -> Vec<u8> {
@@ -14,12 +14,12 @@ fn file(name: &str) -> Vec<u8> {
 fn is_usable(file: &[u8]) -> bool {
     let Ok(model) = Model::decode(file) else { return false };
     for role in [Role::Actor, Role::Critic] {
-        let Ok(layout) = layout_of(&model, role) else { continue };
-        let Ok(mut network) = BoundNetwork::new(&model, role, &layout) else { continue };
-        let (observation, goal) = (vec![0.5; layout.n_observation()], vec![-0.5; layout.n_goal()]);
+        let Ok(task) = task_of(&model, role) else { continue };
+        let Ok(mut network) = BoundNetwork::new(&model, role, &task) else { continue };
+        let (observation, goal) = (vec![0.5; task.n_observation()], vec![-0.5; task.n_goal()]);
         let mut output = vec![0.0; model.network.n_output];
-        network.run(&observation, &goal, &vec![0.25; layout.n_action()], &mut output);
-        if let Ok(policy) = import(&model, None, layout) {
+        network.run(&observation, &goal, &vec![0.25; task.n_action()], &mut output);
+        if let Ok(policy) = import(&model, None, task) {
             policy.check().expect("an imported policy is valid");
         }
     }

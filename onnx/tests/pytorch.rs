@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use tandem_core::{Layout, Task};
-use tandem_onnx::binding::layout_of;
+use tandem_onnx::binding::task_of;
 use tandem_onnx::{BoundNetwork, Model, Role, import};
 
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
@@ -53,7 +53,7 @@ fn exported_actors_act_as_in_pytorch() {
         for exporter in EXPORTERS {
             let model = model(name, exporter);
             assert_eq!(
-                layout_of(&model, Role::Actor).expect("as exported"),
+                task_of(&model, Role::Actor).expect("as exported"),
                 LAYOUT.into(),
                 "{name}, {exporter}"
             );

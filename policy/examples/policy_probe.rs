@@ -17,21 +17,21 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let n_rows = std::env::args().nth(2).map_or(Ok(DEFAULT_ROWS), |rows| rows.parse::<usize>())?;
     let policy = Policy::load(Path::new(&file))?;
     let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
-    let layout = &policy.layout;
+    let task = &policy.task;
 
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw =
         |n: usize| (0..n_rows * n).map(|_| uniform(&mut rng, -0.5, 0.5)).collect::<Vec<f32>>();
-    let (observations, goals) = (draw(layout.n_observation()), draw(layout.n_goal()));
-    let mut actions = vec![0.0; n_rows * layout.n_action()];
+    let (observations, goals) = (draw(task.n_observation()), draw(task.n_goal()));
+    let mut actions = vec![0.0; n_rows * task.n_action()];
     let mut q = vec![0.0; n_rows * critic.n_heads()];
     actor.act(&observations, &goals, &mut actions);
     critic.q(&observations, &goals, &actions, &mut q);
     let probe = json!({
         "digest": policy.digest(),
-        "observations": observations.chunks(layout.n_observation()).collect::<Vec<_>>(),
-        "goals": goals.chunks(layout.n_goal()).collect::<Vec<_>>(),
-        "actions": actions.chunks(layout.n_action()).collect::<Vec<_>>(),
+        "observations": observations.chunks(task.n_observation()).collect::<Vec<_>>(),
+        "goals": goals.chunks(task.n_goal()).collect::<Vec<_>>(),
+        "actions": actions.chunks(task.n_action()).collect::<Vec<_>>(),
         "q": q.chunks(critic.n_heads()).collect::<Vec<_>>(),
     });
     println!("{probe}");

@@ -16,7 +16,7 @@ use crate::policy::Policy;
 #[derive(Debug, Clone)]
 pub struct BlindActor {
     actor: Actor,
-    layout: TaskSpec,
+    task: TaskSpec,
     mean_observation: Vec<f32>,
     mean_goal: Vec<f32>,
     /// The views of one observation: one row per arm, and the full view.
@@ -31,17 +31,17 @@ impl BlindActor {
     /// # Errors
     /// Returns an error if a vector of the policy has the wrong length or contains an invalid number.
     pub fn new(policy: &Policy) -> Result<Self, Error> {
-        let layout = policy.layout.clone();
-        let n_views = layout.n_arms() + 1;
+        let task = policy.task.clone();
+        let n_views = task.n_arms() + 1;
         let NormalizerSnapshot { mean: mean_observation, .. } = &policy.observation_normalizer;
         Ok(Self {
             actor: policy.actor()?,
             mean_observation: mean_observation.clone(),
             mean_goal: policy.goal_normalizer.mean.clone(),
-            observations: vec![0.0; n_views * layout.n_observation()],
-            goals: vec![0.0; n_views * layout.n_goal()],
-            actions: vec![0.0; n_views * layout.n_action()],
-            layout,
+            observations: vec![0.0; n_views * task.n_observation()],
+            goals: vec![0.0; n_views * task.n_goal()],
+            actions: vec![0.0; n_views * task.n_action()],
+            task,
         })
     }
 
@@ -49,14 +49,14 @@ impl BlindActor {
     /// `goals`, shape `[n, n_goal]`. As for [`Actor`], the bits of a row do not depend on the batch.
     ///
     /// # Panics
-    /// If the lengths do not match the layout or each other.
+    /// If the lengths do not match the task or each other.
     pub fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
         let (n_observation, n_goal, n_action) =
-            (self.layout.n_observation(), self.layout.n_goal(), self.layout.n_action());
+            (self.task.n_observation(), self.task.n_goal(), self.task.n_action());
         let n_rows = observations.len() / n_observation;
         let lengths = (observations.len(), goals.len(), actions.len());
         let expected = (n_rows * n_observation, n_rows * n_goal, n_rows * n_action);
-        assert_eq!(lengths, expected, "observations, goals or actions of another layout");
+        assert_eq!(lengths, expected, "observations, goals or actions of another task");
         let observations = observations.chunks_exact(n_observation);
         let rows = observations.zip(goals.chunks_exact(n_goal));
         for ((observation, goal), action) in rows.zip(actions.chunks_exact_mut(n_action)) {
@@ -65,21 +65,21 @@ impl BlindActor {
     }
 
     fn act_on(&mut self, observation: &[f32], goal: &[f32], action: &mut [f32]) {
-        let layout = &self.layout;
-        let views = self.observations.chunks_exact_mut(layout.n_observation());
+        let task = &self.task;
+        let views = self.observations.chunks_exact_mut(task.n_observation());
         for (arm_idx, view) in views.enumerate() {
-            let part = |arm| layout.observation_of(arm);
-            write_view(layout, arm_idx, part, observation, &self.mean_observation, view);
+            let part = |arm| task.observation_of(arm);
+            write_view(task, arm_idx, part, observation, &self.mean_observation, view);
         }
-        for (arm_idx, view) in self.goals.chunks_exact_mut(layout.n_goal()).enumerate() {
-            write_view(layout, arm_idx, |arm| layout.goal_of(arm), goal, &self.mean_goal, view);
+        for (arm_idx, view) in self.goals.chunks_exact_mut(task.n_goal()).enumerate() {
+            write_view(task, arm_idx, |arm| task.goal_of(arm), goal, &self.mean_goal, view);
         }
         self.actor.act(&self.observations, &self.goals, &mut self.actions);
-        let mut chosen = self.actions.chunks_exact(layout.n_action());
+        let mut chosen = self.actions.chunks_exact(task.n_action());
         // The last row is the full view, which decides on components that belong to no arm.
         action.copy_from_slice(chosen.next_back().expect("one row per arm, and one more"));
-        for (arm, of_arm) in layout.arms().zip(chosen) {
-            let part = layout.action_of(arm);
+        for (arm, of_arm) in task.arms().zip(chosen) {
+            let part = task.action_of(arm);
             part.write(action, &part.of(of_arm));
         }
     }
@@ -88,7 +88,7 @@ impl BlindActor {
 /// Writes what arm `arm_idx` sees of `vector`: the parts of all other arms are those of `mean`. An index that no arm
 /// has sees everything.
 fn write_view<'a>(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     arm_idx: usize,
     part_of: impl Fn(tandem_core::ArmIndex) -> &'a Part,
     vector: &[f32],
@@ -96,8 +96,8 @@ fn write_view<'a>(
     view: &mut [f32],
 ) {
     view.copy_from_slice(vector);
-    let is_arm = arm_idx < layout.n_arms();
-    for other in layout.arms().filter(|arm| is_arm && arm.0 != arm_idx) {
+    let is_arm = arm_idx < task.n_arms();
+    for other in task.arms().filter(|arm| is_arm && arm.0 != arm_idx) {
         let part = part_of(other);
         part.write(view, &part.of(mean));
     }

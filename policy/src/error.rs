@@ -5,7 +5,7 @@ use std::path::PathBuf;
 /// An error of creating, reading or writing a policy.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A vector does not have the length that follows from the layout and the network's sizes.
+    /// A vector does not have the length that follows from the task and the network's sizes.
     #[error("{name} has {got} numbers, expected {expected}")]
     WrongLength {
         /// Name of the vector.

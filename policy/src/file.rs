@@ -106,20 +106,20 @@ fn metadata(policy: &Policy) -> BTreeMap<String, String> {
 
 /// Returns the entries that the format defines, in the order in which a reader checks them.
 fn reserved(policy: &Policy) -> Vec<(&'static str, String)> {
-    let layout = &policy.layout;
-    let description = layout.as_built_in().is_none().then(|| description_entry(layout));
+    let task = &policy.task;
+    let description = task.as_built_in().is_none().then(|| description_entry(task));
     let version = if description.is_some() { DESCRIBED_FORMAT_VERSION } else { FORMAT_VERSION };
     let entries = [
         ("format", FORMAT.to_owned()),
         ("format_version", version.to_owned()),
-        ("task", layout.name().to_owned()),
-        ("n_arms", layout.n_arms().to_string()),
+        ("task", task.name().to_owned()),
+        ("n_arms", task.n_arms().to_string()),
         ("n_hidden", policy.n_hidden.to_string()),
         ("n_hidden_layers", policy.n_hidden_layers.to_string()),
         ("n_heads", policy.n_heads.to_string()),
-        ("n_observation", layout.n_observation().to_string()),
-        ("n_goal", layout.n_goal().to_string()),
-        ("n_action", layout.n_action().to_string()),
+        ("n_observation", task.n_observation().to_string()),
+        ("n_goal", task.n_goal().to_string()),
+        ("n_action", task.n_action().to_string()),
         ("activation", "relu".to_owned()),
         ("output_activation", "tanh".to_owned()),
         ("action_clip", "1".to_owned()),
@@ -129,8 +129,8 @@ fn reserved(policy: &Policy) -> Vec<(&'static str, String)> {
     entries.into_iter().chain(description.map(|text| ("description", text))).collect()
 }
 
-fn description_entry(layout: &TaskSpec) -> String {
-    json!(layout.description()).to_string()
+fn description_entry(task: &TaskSpec) -> String {
+    json!(task.description()).to_string()
 }
 
 fn decode(bytes: &[u8]) -> Result<Policy, FormatError> {
@@ -155,7 +155,7 @@ fn read_policy(
     metadata: BTreeMap<String, String>,
 ) -> Result<Policy, FormatError> {
     expect_entry(&metadata, "format", FORMAT)?;
-    let layout = match entry(&metadata, "format_version")? {
+    let task = match entry(&metadata, "format_version")? {
         DESCRIBED_FORMAT_VERSION => parse_description(&metadata)?,
         FORMAT_VERSION => {
             let task = parse_task(&metadata)?;
@@ -182,15 +182,15 @@ fn read_policy(
         n_hidden,
         n_hidden_layers,
         n_heads,
-        actor: read_network(file, "actor", &MlpShape::actor(&layout, n_hidden, n_hidden_layers))?,
+        actor: read_network(file, "actor", &MlpShape::actor(&task, n_hidden, n_hidden_layers))?,
         critic: read_network(
             file,
             "critic.0",
-            &MlpShape::critic(&layout, n_hidden, n_hidden_layers, n_heads),
+            &MlpShape::critic(&task, n_hidden, n_hidden_layers, n_heads),
         )?,
-        observation_normalizer: normalizer("observation", layout.n_observation())?,
-        goal_normalizer: normalizer("goal", layout.n_goal())?,
-        layout,
+        observation_normalizer: normalizer("observation", task.n_observation())?,
+        goal_normalizer: normalizer("goal", task.n_goal())?,
+        task,
         metadata,
     })
 }

@@ -17,41 +17,41 @@ pub use gate::QueryGate;
 /// Normalisation of observations and goals for the input of a network.
 #[derive(Debug, Clone)]
 struct Inputs {
-    layout: TaskSpec,
+    task: TaskSpec,
     observation: NormalizerSnapshot,
     goal: NormalizerSnapshot,
 }
 
 impl Inputs {
     fn new(
-        layout: TaskSpec,
+        task: TaskSpec,
         observation: NormalizerSnapshot,
         goal: NormalizerSnapshot,
     ) -> Result<Self, Error> {
         check_normalizer(
             ["observation mean", "observation std"],
             &observation,
-            layout.n_observation(),
+            task.n_observation(),
         )?;
-        check_normalizer(["goal mean", "goal std"], &goal, layout.n_goal())?;
-        Ok(Self { layout, observation, goal })
+        check_normalizer(["goal mean", "goal std"], &goal, task.n_goal())?;
+        Ok(Self { task, observation, goal })
     }
 
     /// Returns the number of rows of `observations` and `goals`.
     fn n_rows(&self, observations: &[f32], goals: &[f32]) -> usize {
-        let n_rows = observations.len() / self.layout.n_observation();
-        let expected = (n_rows * self.layout.n_observation(), n_rows * self.layout.n_goal());
+        let n_rows = observations.len() / self.task.n_observation();
+        let expected = (n_rows * self.task.n_observation(), n_rows * self.task.n_goal());
         assert_eq!(
             (observations.len(), goals.len()),
             expected,
-            "observations and goals of another layout"
+            "observations and goals of another task"
         );
         n_rows
     }
 
     /// Writes row `row_idx` of `observations` and `goals`, normalised, to the start of `input`.
     fn write(&self, observations: &[f32], goals: &[f32], row_idx: usize, input: &mut [f32]) {
-        let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());
+        let (n_observation, n_goal) = (self.task.n_observation(), self.task.n_goal());
         let (observation, rest) = input.split_at_mut(n_observation);
         self.observation
             .normalize(&observations[row_idx * n_observation..][..n_observation], observation);
@@ -75,19 +75,19 @@ impl Actor {
     /// Creates an actor, with its gate if there is one, from parameters that a learner published.
     ///
     /// # Errors
-    /// Returns an error if a size is out of range, a vector does not have the length that follows from `layout` and the
+    /// Returns an error if a size is out of range, a vector does not have the length that follows from `task` and the
     /// sizes, a number is not finite, or a standard deviation is not above 0.
-    pub fn new(layout: impl Into<TaskSpec>, published: PublishedActor) -> Result<Self, Error> {
-        let layout = layout.into();
-        let gate = QueryGate::new(&layout, &published)?;
+    pub fn new(task: impl Into<TaskSpec>, published: PublishedActor) -> Result<Self, Error> {
+        let task = task.into();
+        let gate = QueryGate::new(&task, &published)?;
         let PublishedActor { version, n_hidden, n_hidden_layers, actor, .. } = published;
         check_network_size(n_hidden, n_hidden_layers)?;
-        let shape = MlpShape::actor(&layout, n_hidden, n_hidden_layers);
+        let shape = MlpShape::actor(&task, n_hidden, n_hidden_layers);
         check_parameters("actor", &actor, shape.n_parameters())?;
         let observation =
             NormalizerSnapshot { mean: published.observation_mean, std: published.observation_std };
         let goal = NormalizerSnapshot { mean: published.goal_mean, std: published.goal_std };
-        let inputs = Inputs::new(layout, observation, goal)?;
+        let inputs = Inputs::new(task, observation, goal)?;
         Ok(Self { version, gate, inputs, network: PackedMlp::new(&shape, &actor) })
     }
 
@@ -99,15 +99,15 @@ impl Actor {
 
     /// Returns the task.
     #[must_use]
-    pub const fn layout(&self) -> &TaskSpec {
-        &self.inputs.layout
+    pub const fn task(&self) -> &TaskSpec {
+        &self.inputs.task
     }
 
     /// Returns true if a student that acts `action`, shape `[n_action]`, is to ask for advice: always without a
     /// [gate](QueryGate). Shapes: `observation` `[n_observation]`, `goal` `[n_goal]`.
     ///
     /// # Panics
-    /// If the lengths do not match the layout.
+    /// If the lengths do not match the task.
     pub fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
         self.gate.as_mut().is_none_or(|gate| gate.asks(observation, goal, action))
     }
@@ -116,11 +116,11 @@ impl Actor {
     /// `goals`, shape `[n, n_goal]`.
     ///
     /// # Panics
-    /// If the lengths do not match the layout or each other.
+    /// If the lengths do not match the task or each other.
     pub fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
         let n_rows = self.inputs.n_rows(observations, goals);
-        let n_action = self.inputs.layout.n_action();
-        assert_eq!(actions.len(), n_rows * n_action, "actions of another layout");
+        let n_action = self.inputs.task.n_action();
+        assert_eq!(actions.len(), n_rows * n_action, "actions of another task");
         for first in (0..n_rows).step_by(MAX_ROWS) {
             let n_now = MAX_ROWS.min(n_rows - first);
             for row in 0..n_now {
@@ -154,18 +154,18 @@ impl Critic {
     ///
     /// # Errors
     /// Returns an error if a size is out of range, the input of `shape` or the length of a vector does not match
-    /// `layout`, a number is not finite, or a standard deviation is not above 0.
+    /// `task`, a number is not finite, or a standard deviation is not above 0.
     pub fn new(
-        layout: impl Into<TaskSpec>,
+        task: impl Into<TaskSpec>,
         shape: &MlpShape,
         parameters: &[f32],
         observation: NormalizerSnapshot,
         goal: NormalizerSnapshot,
     ) -> Result<Self, Error> {
-        let layout = layout.into();
+        let task = task.into();
         check_network_size(shape.n_hidden, shape.n_hidden_layers)?;
         let fitting =
-            MlpShape::critic(&layout, shape.n_hidden, shape.n_hidden_layers, shape.n_output);
+            MlpShape::critic(&task, shape.n_hidden, shape.n_hidden_layers, shape.n_output);
         if fitting.n_input != shape.n_input {
             return Err(Error::WrongLength {
                 name: "critic input",
@@ -174,7 +174,7 @@ impl Critic {
             });
         }
         check_parameters("critic", parameters, shape.n_parameters())?;
-        let inputs = Inputs::new(layout, observation, goal)?;
+        let inputs = Inputs::new(task, observation, goal)?;
         Ok(Self { n_heads: shape.n_output, inputs, network: PackedMlp::new(shape, parameters) })
     }
 
@@ -188,12 +188,12 @@ impl Critic {
     /// `[n, n_observation]`, and `goals`, shape `[n, n_goal]`.
     ///
     /// # Panics
-    /// If the lengths do not match the layout or each other.
+    /// If the lengths do not match the task or each other.
     pub fn q(&mut self, observations: &[f32], goals: &[f32], actions: &[f32], q: &mut [f32]) {
         let n_rows = self.inputs.n_rows(observations, goals);
-        let (n_action, n_heads) = (self.inputs.layout.n_action(), self.n_heads);
+        let (n_action, n_heads) = (self.inputs.task.n_action(), self.n_heads);
         let expected = (n_rows * n_action, n_rows * n_heads);
-        assert_eq!((actions.len(), q.len()), expected, "actions or values of another layout");
+        assert_eq!((actions.len(), q.len()), expected, "actions or values of another task");
         for first in (0..n_rows).step_by(MAX_ROWS) {
             let n_now = MAX_ROWS.min(n_rows - first);
             for row in 0..n_now {
@@ -221,19 +221,19 @@ mod tests {
 
     const N_ROWS: usize = 70;
 
-    fn inputs(layout: &TaskSpec) -> [Vec<f32>; 3] {
+    fn inputs(task: &TaskSpec) -> [Vec<f32>; 3] {
         let mut rng = episode_rng(5, 0, Stream::Reset);
-        [layout.n_observation(), layout.n_goal(), layout.n_action()]
+        [task.n_observation(), task.n_goal(), task.n_action()]
             .map(|n| (0..N_ROWS * n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect())
     }
 
     #[test]
     fn a_batch_gives_the_same_bits_as_its_rows_one_by_one() {
         let policy = Policy::sample(Layout::new(Task::PickAndPlace, 2), 2);
-        let layout = &policy.layout;
+        let task = &policy.task;
         let (n_observation, n_goal, n_action) =
-            (layout.n_observation(), layout.n_goal(), layout.n_action());
-        let [observations, goals, _] = inputs(layout);
+            (task.n_observation(), task.n_goal(), task.n_action());
+        let [observations, goals, _] = inputs(task);
         let (mut actor, mut critic) = (policy.actor().unwrap(), policy.critic().unwrap());
         let (mut actions, mut q) = (vec![0.0; N_ROWS * n_action], vec![0.0; N_ROWS * 2]);
         actor.act(&observations, &goals, &mut actions);
@@ -256,7 +256,7 @@ mod tests {
     #[test]
     fn a_value_depends_on_its_own_action_only() {
         let policy = Policy::sample(Layout::new(Task::Push, 1), 1);
-        let [observations, goals, mut actions] = inputs(&policy.layout);
+        let [observations, goals, mut actions] = inputs(&policy.task);
         let mut critic = policy.critic().unwrap();
         let (mut before, mut after) = (vec![0.0; N_ROWS], vec![0.0; N_ROWS]);
         critic.q(&observations, &goals, &actions, &mut before);
@@ -273,7 +273,7 @@ mod tests {
         let check = |spoil: fn(&mut PublishedActor), expected: &str| {
             let mut published = policy.published(3);
             spoil(&mut published);
-            let error = Actor::new(&policy.layout, published).expect_err("must be refused");
+            let error = Actor::new(&policy.task, published).expect_err("must be refused");
             assert_eq!(error.to_string(), expected);
         };
         check(|actor| actor.actor.truncate(2178), "actor has 2178 numbers, expected 2179");
@@ -285,7 +285,7 @@ mod tests {
             "observation std holds a number that is not above 0",
         );
         assert_eq!(
-            Actor::new(&policy.layout, policy.published(3)).map(|actor| actor.version()).unwrap(),
+            Actor::new(&policy.task, policy.published(3)).map(|actor| actor.version()).unwrap(),
             3
         );
     }

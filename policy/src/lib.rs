@@ -15,9 +15,9 @@
 //! let policy = Policy::load(path.as_ref())?;
 //! let (mut actor, mut critic) = (policy.actor()?, policy.critic()?);
 //!
-//! let observation = vec![0.0; policy.layout.n_observation()]; // metres, radians; in arm frames
-//! let goal = vec![0.1; policy.layout.n_goal()]; // metres, in arm frames
-//! let mut action = vec![0.0; policy.layout.n_action()];
+//! let observation = vec![0.0; policy.task.n_observation()]; // metres, radians; in arm frames
+//! let goal = vec![0.1; policy.task.n_goal()]; // metres, in arm frames
+//! let mut action = vec![0.0; policy.task.n_action()];
 //! let mut values = vec![0.0; critic.n_heads()];
 //! actor.act(&observation, &goal, &mut action);
 //! critic.q(&observation, &goal, &action, &mut values);

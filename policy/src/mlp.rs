@@ -33,23 +33,23 @@ pub struct MlpShape {
 impl MlpShape {
     /// Returns the shape of an actor, which maps normalised observation and goal to an action before its tanh.
     #[must_use]
-    pub fn actor(layout: impl Into<TaskSpec>, n_hidden: usize, n_hidden_layers: usize) -> Self {
-        let layout = layout.into();
-        let n_input = layout.n_observation() + layout.n_goal();
-        Self { n_input, n_hidden, n_hidden_layers, n_output: layout.n_action() }
+    pub fn actor(task: impl Into<TaskSpec>, n_hidden: usize, n_hidden_layers: usize) -> Self {
+        let task = task.into();
+        let n_input = task.n_observation() + task.n_goal();
+        Self { n_input, n_hidden, n_hidden_layers, n_output: task.n_action() }
     }
 
     /// Returns the shape of a critic, which maps normalised observation and goal, then the action, to one value per
     /// head.
     #[must_use]
     pub fn critic(
-        layout: impl Into<TaskSpec>,
+        task: impl Into<TaskSpec>,
         n_hidden: usize,
         n_hidden_layers: usize,
         n_heads: usize,
     ) -> Self {
-        let layout = layout.into();
-        let n_input = layout.n_observation() + layout.n_goal() + layout.n_action();
+        let task = task.into();
+        let n_input = task.n_observation() + task.n_goal() + task.n_action();
         Self { n_input, n_hidden, n_hidden_layers, n_output: n_heads }
     }
 

@@ -21,7 +21,7 @@ pub use crate::validation::{MAX_HEADS, MAX_HIDDEN, MAX_HIDDEN_LAYERS};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
     /// The task.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// Units of each hidden layer of both networks.
     pub n_hidden: usize,
     /// Number of hidden layers of both networks.
@@ -61,13 +61,13 @@ impl Policy {
     /// Returns the sizes of the actor.
     #[must_use]
     pub fn actor_shape(&self) -> MlpShape {
-        MlpShape::actor(&self.layout, self.n_hidden, self.n_hidden_layers)
+        MlpShape::actor(&self.task, self.n_hidden, self.n_hidden_layers)
     }
 
     /// Returns the sizes of the critic.
     #[must_use]
     pub fn critic_shape(&self) -> MlpShape {
-        MlpShape::critic(&self.layout, self.n_hidden, self.n_hidden_layers, self.n_heads)
+        MlpShape::critic(&self.task, self.n_hidden, self.n_hidden_layers, self.n_heads)
     }
 
     /// Creates the actor, which chooses actions.
@@ -75,7 +75,7 @@ impl Policy {
     /// # Errors
     /// Returns an error if a size is out of range, or a vector has the wrong length or contains an invalid number.
     pub fn actor(&self) -> Result<Actor, Error> {
-        Actor::new(&self.layout, self.published(0))
+        Actor::new(&self.task, self.published(0))
     }
 
     /// Creates the critic, which values actions.
@@ -85,7 +85,7 @@ impl Policy {
     pub fn critic(&self) -> Result<Critic, Error> {
         let (observation, goal) =
             (self.observation_normalizer.clone(), self.goal_normalizer.clone());
-        Critic::new(&self.layout, &self.critic_shape(), &self.critic, observation, goal)
+        Critic::new(&self.task, &self.critic_shape(), &self.critic, observation, goal)
     }
 
     /// Returns true unless the metadata says that the policy has no critic; see [`NO_CRITIC`].
@@ -119,10 +119,10 @@ impl Policy {
     pub fn check(&self) -> Result<(), Error> {
         check_network_size(self.n_hidden, self.n_hidden_layers)?;
         check_size("n_heads", self.n_heads, MAX_HEADS)?;
-        check_heads(self.n_heads, self.layout.n_arms())?;
+        check_heads(self.n_heads, self.task.n_arms())?;
         check_parameters("actor", &self.actor, self.actor_shape().n_parameters())?;
         check_parameters("critic", &self.critic, self.critic_shape().n_parameters())?;
-        let (n_observation, n_goal) = (self.layout.n_observation(), self.layout.n_goal());
+        let (n_observation, n_goal) = (self.task.n_observation(), self.task.n_goal());
         check_normalizer(
             ["observation mean", "observation std"],
             &self.observation_normalizer,
@@ -164,8 +164,8 @@ impl Policy {
 /// # Panics
 /// If the parameter vector is too short for the network; see [`Actor::new`].
 #[must_use]
-pub fn actor_digest(layout: &TaskSpec, published: &PublishedActor) -> String {
-    let shape = MlpShape::actor(layout, published.n_hidden, published.n_hidden_layers);
+pub fn actor_digest(task: &TaskSpec, published: &PublishedActor) -> String {
+    let shape = MlpShape::actor(task, published.n_hidden, published.n_hidden_layers);
     let mut tensors = network_tensors("actor", &shape, &published.actor);
     tensors.extend(normalizer_tensors([
         [&published.observation_mean, &published.observation_std],
@@ -219,25 +219,25 @@ pub(crate) fn little_endian(numbers: &[f32]) -> Vec<u8> {
 #[cfg(test)]
 impl Policy {
     /// Creates a small policy with arbitrary numbers and two hidden layers of 32 units.
-    pub(crate) fn sample(layout: impl Into<TaskSpec>, n_heads: usize) -> Self {
-        let layout = layout.into();
+    pub(crate) fn sample(task: impl Into<TaskSpec>, n_heads: usize) -> Self {
+        let task = task.into();
         use tandem_core::rng::uniform;
         use tandem_core::{Stream, episode_rng};
 
         let mut rng = episode_rng(11, 0, Stream::Initialisation);
         let (actor, critic) =
-            (MlpShape::actor(&layout, 32, 2), MlpShape::critic(&layout, 32, 2, n_heads));
+            (MlpShape::actor(&task, 32, 2), MlpShape::critic(&task, 32, 2, n_heads));
         let (actor, critic) = (actor.initialise(&mut rng), critic.initialise(&mut rng));
         let mut normalizer = |size: usize| NormalizerSnapshot {
             mean: (0..size).map(|_| uniform(&mut rng, -0.2, 0.2)).collect(),
             std: (0..size).map(|_| uniform(&mut rng, 0.01, 0.6)).collect(),
         };
         let (observation_normalizer, goal_normalizer) =
-            (normalizer(layout.n_observation()), normalizer(layout.n_goal()));
+            (normalizer(task.n_observation()), normalizer(task.n_goal()));
         let metadata =
             BTreeMap::from([("trained".to_owned(), "for a test, \"quoted\"".to_owned())]);
         Self {
-            layout,
+            task,
             n_hidden: 32,
             n_hidden_layers: 2,
             n_heads,

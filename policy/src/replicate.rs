@@ -10,35 +10,35 @@ use crate::normalizer::NormalizerSnapshot;
 use crate::policy::Policy;
 
 impl Policy {
-    /// Creates a policy for the task `layout` in which each arm acts, and is valued, as by this one-arm policy.
+    /// Creates a policy for `task` in which each arm acts, and is valued, as by this one-arm policy.
     ///
     /// The networks are wider by the number of arms and block-diagonal, and the critic has one head per arm. The
     /// metadata is empty.
     ///
     /// # Panics
     /// If this policy has several arms or critic heads, its task is not the [one-arm task](TaskSpec::single_arm) of
-    /// `layout`, or a vector has the wrong length; see [`Policy::check`].
+    /// `task`, or a vector has the wrong length; see [`Policy::check`].
     #[must_use]
-    pub fn replicated(&self, layout: &TaskSpec) -> Self {
+    pub fn replicated(&self, task: &TaskSpec) -> Self {
         assert_eq!(
-            (self.layout.n_arms(), self.n_heads),
+            (self.task.n_arms(), self.n_heads),
             (1, 1),
             "only a one-arm policy can be copied"
         );
-        let of_one_arm = layout.single_arm();
-        let is_same = of_one_arm.is_some_and(|one| one.difference(&self.layout).is_none());
+        let of_one_arm = task.single_arm();
+        let is_same = of_one_arm.is_some_and(|one| one.difference(&self.task).is_none());
         assert!(is_same, "arms of another task");
-        let n_arms = layout.n_arms();
+        let n_arms = task.n_arms();
         let (n_hidden, n_heads) = (self.n_hidden * n_arms, n_arms);
-        let actor_shape = MlpShape::actor(layout, n_hidden, self.n_hidden_layers);
-        let critic_shape = MlpShape::critic(layout, n_hidden, self.n_hidden_layers, n_heads);
+        let actor_shape = MlpShape::actor(task, n_hidden, self.n_hidden_layers);
+        let critic_shape = MlpShape::critic(task, n_hidden, self.n_hidden_layers, n_heads);
         let mut actor = vec![0.0; actor_shape.n_parameters()];
         let mut critic = vec![0.0; critic_shape.n_parameters()];
-        for arm in layout.arms() {
+        for arm in task.arms() {
             let first_hidden = arm.0 * self.n_hidden;
-            let inputs = state_columns(layout, arm);
-            let actions: Vec<usize> = layout.action_of(arm).iter().collect();
-            let n_state = layout.n_observation() + layout.n_goal();
+            let inputs = state_columns(task, arm);
+            let actions: Vec<usize> = task.action_of(arm).iter().collect();
+            let n_state = task.n_observation() + task.n_goal();
             let joined: Vec<usize> =
                 inputs.iter().copied().chain(actions.iter().map(|i| n_state + i)).collect();
             let block = Block { first_hidden, inputs: &inputs, outputs: &actions };
@@ -46,10 +46,10 @@ impl Policy {
             let block = Block { first_hidden, inputs: &joined, outputs: &[arm.0] };
             block.write(&self.critic_shape(), &self.critic, &critic_shape, &mut critic);
         }
-        let observations = layout.arms().map(|arm| layout.observation_of(arm));
-        let goals = layout.arms().map(|arm| layout.goal_of(arm));
+        let observations = task.arms().map(|arm| task.observation_of(arm));
+        let goals = task.arms().map(|arm| task.goal_of(arm));
         Self {
-            layout: layout.clone(),
+            task: task.clone(),
             n_hidden,
             n_hidden_layers: self.n_hidden_layers,
             n_heads,
@@ -63,9 +63,9 @@ impl Policy {
 }
 
 /// Returns the indices of `arm`'s numbers in the concatenation of observation and goal.
-fn state_columns(layout: &TaskSpec, arm: ArmIndex) -> Vec<usize> {
-    let goals = layout.goal_of(arm).iter().map(|i| layout.n_observation() + i);
-    layout.observation_of(arm).iter().chain(goals).collect()
+fn state_columns(task: &TaskSpec, arm: ArmIndex) -> Vec<usize> {
+    let goals = task.goal_of(arm).iter().map(|i| task.n_observation() + i);
+    task.observation_of(arm).iter().chain(goals).collect()
 }
 
 /// The place of a network in one that is wider.
@@ -139,7 +139,7 @@ mod tests {
         let critic = MlpShape::critic(LAYOUT, n_hidden, n_hidden_layers, 1).n_parameters();
         let (n_observation, n_goal) = (LAYOUT.n_observation(), LAYOUT.n_goal());
         Policy {
-            layout: LAYOUT.into(),
+            task: LAYOUT.into(),
             n_hidden,
             n_hidden_layers,
             n_heads: 1,
@@ -179,32 +179,32 @@ mod tests {
     fn each_arm_acts_and_is_valued_as_by_the_one_arm_policy() {
         let one = one_arm();
         check_copies(&one, &Layout::new(Task::PickAndPlace, 2).into());
-        let layout = interleaved();
-        check_copies(&Policy { layout: layout.single_arm().unwrap(), ..one }, &layout);
+        let task = interleaved();
+        check_copies(&Policy { task: task.single_arm().unwrap(), ..one }, &task);
     }
 
-    fn check_copies(one: &Policy, layout: &TaskSpec) {
-        let both = one.replicated(layout);
+    fn check_copies(one: &Policy, task: &TaskSpec) {
+        let both = one.replicated(task);
         both.check().unwrap();
         let mut rng = episode_rng(6, 0, Stream::Initialisation);
         let mut draw = |n: usize| (0..n).map(|_| uniform(&mut rng, -1.0, 1.0)).collect::<Vec<_>>();
-        let (observation, goal) = (draw(layout.n_observation()), draw(layout.n_goal()));
-        let actions_taken = draw(layout.n_action());
+        let (observation, goal) = (draw(task.n_observation()), draw(task.n_goal()));
+        let actions_taken = draw(task.n_action());
 
         let (mut acting, mut valuing) = (both.actor().unwrap(), both.critic().unwrap());
-        let mut actions = vec![0.0; layout.n_action()];
+        let mut actions = vec![0.0; task.n_action()];
         acting.act(&observation, &goal, &mut actions);
         let mut values = vec![0.0; 2];
         valuing.q(&observation, &goal, &actions_taken, &mut values);
-        for arm in layout.arms() {
-            let observation = layout.observation_of(arm).of(&observation);
-            let goal = layout.goal_of(arm).of(&goal);
+        for arm in task.arms() {
+            let observation = task.observation_of(arm).of(&observation);
+            let goal = task.goal_of(arm).of(&goal);
             let mut action = vec![0.0; LAYOUT.n_action()];
             one.actor().unwrap().act(&observation, &goal, &mut action);
             let mut value = vec![0.0];
-            let alone = layout.action_of(arm).of(&actions_taken);
+            let alone = task.action_of(arm).of(&actions_taken);
             one.critic().unwrap().q(&observation, &goal, &alone, &mut value);
-            for (got, expected) in layout.action_of(arm).of(&actions).iter().zip(&action) {
+            for (got, expected) in task.action_of(arm).of(&actions).iter().zip(&action) {
                 assert!((got - expected).abs() < 1e-5, "arm {arm:?}: {got} against {expected}");
             }
             let got = values[arm.0];

@@ -34,12 +34,12 @@ impl Policy {
     /// If a vector has the wrong length; see [`Policy::check`].
     #[must_use]
     pub fn symmetrized(self) -> Self {
-        if !self.layout.has_interchangeable_arms() || self.is_symmetrized() {
+        if !self.task.has_interchangeable_arms() || self.is_symmetrized() {
             return self;
         }
         let (observation, goal) = (&self.observation_normalizer, &self.goal_normalizer);
-        let inputs = reversed_inputs(&self.layout, observation, goal);
-        let actions = reversed(&self.layout, TaskSpec::action_of, self.layout.n_action());
+        let inputs = reversed_inputs(&self.task, observation, goal);
+        let actions = reversed(&self.task, TaskSpec::action_of, self.task.n_action());
         let n_state = inputs.len();
         let joined = inputs.iter().copied().chain(actions.iter().map(|from| Input {
             from: n_state + from,
@@ -56,23 +56,23 @@ impl Policy {
     }
 }
 
-/// Returns the actor of [`Policy::symmetrized`] for a published actor of the task `layout`, without its gate.
+/// Returns the actor of [`Policy::symmetrized`] for a published actor of `task`, without its gate.
 ///
 /// # Panics
 /// If a vector has the wrong length; see [`Actor::new`](crate::Actor::new).
 #[must_use]
-pub fn symmetrized_actor(layout: &TaskSpec, published: &PublishedActor) -> PublishedActor {
+pub fn symmetrized_actor(task: &TaskSpec, published: &PublishedActor) -> PublishedActor {
     let published = PublishedActor { gate: None, ..published.clone() };
-    if !layout.has_interchangeable_arms() {
+    if !task.has_interchangeable_arms() {
         return published;
     }
     let normalizer =
         |mean: &[f32], std: &[f32]| NormalizerSnapshot { mean: mean.to_vec(), std: std.to_vec() };
     let observation = normalizer(&published.observation_mean, &published.observation_std);
     let goal = normalizer(&published.goal_mean, &published.goal_std);
-    let inputs = reversed_inputs(layout, &observation, &goal);
-    let actions = reversed(layout, TaskSpec::action_of, layout.n_action());
-    let shape = MlpShape::actor(layout, published.n_hidden, published.n_hidden_layers);
+    let inputs = reversed_inputs(task, &observation, &goal);
+    let actions = reversed(task, TaskSpec::action_of, task.n_action());
+    let shape = MlpShape::actor(task, published.n_hidden, published.n_hidden_layers);
     let actor = symmetrized(&shape, &published.actor, &inputs, &actions);
     PublishedActor { n_hidden: 2 * published.n_hidden, actor, ..published }
 }
@@ -88,14 +88,14 @@ struct Input {
 /// Returns, for each place of a vector of `n` numbers, the place of the same number of the arm that takes its arm's place
 /// when the order of the arms is reversed.
 fn reversed(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     part_of: impl Fn(&TaskSpec, ArmIndex) -> &Part,
     n: usize,
 ) -> Vec<usize> {
     let mut places: Vec<usize> = (0..n).collect();
-    let arms: Vec<_> = layout.arms().collect();
+    let arms: Vec<_> = task.arms().collect();
     for (to, from) in arms.iter().zip(arms.iter().rev()) {
-        for (to, from) in part_of(layout, *to).iter().zip(part_of(layout, *from).iter()) {
+        for (to, from) in part_of(task, *to).iter().zip(part_of(task, *from).iter()) {
             places[to] = from;
         }
     }
@@ -104,13 +104,13 @@ fn reversed(
 
 /// Returns the normalised inputs of the scene with its arms in reverse order, as functions of those of the scene.
 fn reversed_inputs(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     observation: &NormalizerSnapshot,
     goal: &NormalizerSnapshot,
 ) -> Vec<Input> {
-    let n_observation = layout.n_observation();
-    let observations = reversed(layout, TaskSpec::observation_of, n_observation);
-    let goals = reversed(layout, TaskSpec::goal_of, layout.n_goal());
+    let n_observation = task.n_observation();
+    let observations = reversed(task, TaskSpec::observation_of, n_observation);
+    let goals = reversed(task, TaskSpec::goal_of, task.n_goal());
     let places = observations.into_iter().chain(goals.into_iter().map(|from| n_observation + from));
     let joined = |observation: &[f32], goal: &[f32]| -> Vec<f64> {
         observation.iter().chain(goal).copied().map(f64::from).collect()
@@ -302,7 +302,7 @@ mod tests {
     #[test]
     fn a_published_actor_becomes_that_of_the_symmetrised_policy() {
         let policy = sample(2);
-        let published = symmetrized_actor(&policy.layout, &policy.published(7));
+        let published = symmetrized_actor(&policy.task, &policy.published(7));
         assert_eq!(published, policy.symmetrized().published(7));
     }
 
@@ -316,9 +316,9 @@ mod tests {
 
     #[test]
     fn places_of_reversed_arms_follow_the_description() {
-        let layout: TaskSpec = LAYOUT.into();
-        let places = reversed(&layout, TaskSpec::action_of, layout.n_action());
-        let of = |arm: usize| layout.action_of(ArmIndex(arm)).iter().collect::<Vec<_>>();
+        let task: TaskSpec = LAYOUT.into();
+        let places = reversed(&task, TaskSpec::action_of, task.n_action());
+        let of = |arm: usize| task.action_of(ArmIndex(arm)).iter().collect::<Vec<_>>();
         assert_eq!(places, [of(1), of(0)].concat());
     }
 }

@@ -31,7 +31,7 @@ fn policy() -> Policy {
     let (observation_normalizer, goal_normalizer) =
         (normalizer(layout.n_observation()), normalizer(layout.n_goal()));
     Policy {
-        layout: layout.into(),
+        task: layout.into(),
         n_hidden: 3,
         n_hidden_layers: 1,
         n_heads: 1,

@@ -37,7 +37,7 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
     }
 }
 
-/// Decodes the query of a student with `layout`.
+/// Decodes the query of a student of `task`.
 ///
 /// Any step number is valid; the teacher's account limits the length of an episode.
 ///
@@ -46,20 +46,20 @@ pub fn encode_query(query: &StepQuery) -> pb::StepQuery {
 /// task's bound, or an action is outside [−1, 1].
 pub fn decode_query(
     query: pb::StepQuery,
-    layout: impl Into<TaskSpec>,
+    task: impl Into<TaskSpec>,
 ) -> Result<StepQuery, DecodeError> {
-    let layout = layout.into();
+    let task = task.into();
     // Students may be trained by other programs in other worlds, so the bound is that of a task only if it is larger.
-    let largest = |idx| MAX_MAGNITUDE.max(layout.observation_bound(idx));
-    let largest_goal = |idx| MAX_MAGNITUDE.max(layout.goal_bound(idx));
+    let largest = |idx| MAX_MAGNITUDE.max(task.observation_bound(idx));
+    let largest_goal = |idx| MAX_MAGNITUDE.max(task.goal_bound(idx));
     let judged = (!query.judged_action.is_empty()).then_some(query.judged_action);
-    let decode_judged = |judged| actions("judged_action", judged, layout.n_action());
+    let decode_judged = |judged| actions("judged_action", judged, task.n_action());
     Ok(StepQuery {
         episode: query.episode,
         step: query.step,
-        observation: bounded("observation", query.observation, layout.n_observation(), largest)?,
-        goal: bounded("goal", query.goal, layout.n_goal(), largest_goal)?,
-        proposed_action: actions("proposed_action", query.proposed_action, layout.n_action())?,
+        observation: bounded("observation", query.observation, task.n_observation(), largest)?,
+        goal: bounded("goal", query.goal, task.n_goal(), largest_goal)?,
+        proposed_action: actions("proposed_action", query.proposed_action, task.n_action())?,
         judged_action: judged.map(decode_judged).transpose()?,
         payer: query.payer,
     })
@@ -87,38 +87,38 @@ fn encode_arm(arm: &ArmAdvice) -> pb::ArmAdvice {
     }
 }
 
-/// Decodes advice to a student with `layout`.
+/// Decodes advice to a student of `task`.
 ///
 /// # Errors
-/// Returns an error if a length does not match the layout, a number is not finite, an action is outside [−1, 1] or a
+/// Returns an error if a length does not match the task, a number is not finite, an action is outside [−1, 1] or a
 /// distance is negative.
 pub fn decode_advice(
     advice: pb::StepAdvice,
-    layout: impl Into<TaskSpec>,
+    task: impl Into<TaskSpec>,
 ) -> Result<StepAdvice, DecodeError> {
-    let layout = layout.into();
-    if advice.arms.len() != layout.n_arms() {
-        let expected = format_args!("{} arms", layout.n_arms()).to_string();
+    let task = task.into();
+    if advice.arms.len() != task.n_arms() {
+        let expected = format_args!("{} arms", task.n_arms()).to_string();
         return Err(DecodeError::new("arms", expected, format_args!("{} arms", advice.arms.len())));
     }
     let decode_indexed = |(arm_idx, arm)| {
-        decode_arm(arm, &layout)
+        decode_arm(arm, &task)
             .map_err(|error: DecodeError| error.within(format_args!("arms[{arm_idx}]")))
     };
     Ok(StepAdvice {
-        action: actions("action", advice.action, layout.n_action())?,
+        action: actions("action", advice.action, task.n_action())?,
         charged: advice.charged,
         arms: advice.arms.into_iter().enumerate().map(decode_indexed).collect::<Result<_, _>>()?,
         repeated: advice.repeated,
     })
 }
 
-fn decode_arm(arm: pb::ArmAdvice, layout: &TaskSpec) -> Result<ArmAdvice, DecodeError> {
+fn decode_arm(arm: pb::ArmAdvice, task: &TaskSpec) -> Result<ArmAdvice, DecodeError> {
     Ok(ArmAdvice {
         teacher_action: actions(
             "teacher_action",
             arm.teacher_action,
-            layout.action_of(ArmIndex(0)).len(),
+            task.action_of(ArmIndex(0)).len(),
         )?,
         q_teacher: one_finite("q_teacher", arm.q_teacher)?,
         q_student: one_finite("q_student", arm.q_student)?,

@@ -18,7 +18,7 @@ const MAX_DIGEST: usize = 128;
 #[derive(Debug, Clone, PartialEq)]
 pub struct PolicyDescription {
     /// The task, for one arm.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// The policy's name, for logs.
     pub name: String,
     /// The text that identifies the policy.
@@ -64,7 +64,7 @@ pub fn decode_policy_description(
     message: pb::PolicyDescription,
 ) -> Result<PolicyDescription, DecodeError> {
     let task = message.task.ok_or_else(|| DecodeError::missing("task"))?;
-    let layout = decode_one_arm_task(task).map_err(|error| error.within("task"))?;
+    let task = decode_one_arm_task(task).map_err(|error| error.within("task"))?;
     let name = message.name;
     if name.len() > MAX_NAME || name.chars().any(char::is_control) {
         let expected = format_args!("at most {MAX_NAME} bytes of printable text").to_string();
@@ -76,7 +76,7 @@ pub fn decode_policy_description(
         let expected = format_args!("1 to {MAX_DIGEST} letters, digits, '-', '_', '.' and ':'");
         return Err(DecodeError::new("digest", expected, digest.escape_debug()));
     }
-    Ok(PolicyDescription { layout, name, digest, has_values: message.has_values })
+    Ok(PolicyDescription { task, name, digest, has_values: message.has_values })
 }
 
 /// Decodes a task of one arm. The parts of the built-in tasks are known, so their descriptions need not contain them.
@@ -111,7 +111,7 @@ pub fn decode_policy_answers(
     policy: &PolicyDescription,
 ) -> Result<PolicyAnswers, DecodeError> {
     let n_values = if policy.has_values { n } else { 0 };
-    let actions = actions_from_bytes("actions", &response.actions, n * policy.layout.n_action())?;
+    let actions = actions_from_bytes("actions", &response.actions, n * policy.task.n_action())?;
     Ok(PolicyAnswers {
         actions,
         values: finite_from_bytes("values", &response.values, n_values)?,
@@ -152,7 +152,7 @@ mod tests {
             change(&mut changed);
             assert_eq!(decode_policy_description(changed).unwrap_err().to_string(), message);
         };
-        assert_eq!(decoded().layout, TaskSpec::built_in(Task::Push, 1));
+        assert_eq!(decoded().task, TaskSpec::built_in(Task::Push, 1));
         check(|policy| policy.task = None, "task: expected a message, got none");
         check(
             |policy| policy.task.as_mut().unwrap().name = "lift".to_owned(),

@@ -52,9 +52,9 @@ fn decode_episode_kind(kind: i32) -> Result<EpisodeKind, DecodeError> {
 pub fn encode_run_terms(terms: &RunTerms) -> pb::RunTerms {
     pb::RunTerms {
         run: terms.run.clone(),
-        description: terms.layout.as_built_in().is_none().then(|| encode_task(&terms.layout)),
-        task: terms.layout.name().to_owned(),
-        n_arms: u32::try_from(terms.layout.n_arms()).expect("a layout has few arms"),
+        description: terms.task.as_built_in().is_none().then(|| encode_task(&terms.task)),
+        task: terms.task.name().to_owned(),
+        n_arms: u32::try_from(terms.task.n_arms()).expect("a task has few arms"),
         account: terms.account.clone().unwrap_or_default(),
         exploration: Some(pb::Exploration {
             noise_std: terms.exploration.noise_std,
@@ -87,7 +87,7 @@ pub fn decode_run_terms(terms: pb::RunTerms) -> Result<RunTerms, DecodeError> {
     let account = (!terms.account.is_empty()).then_some(terms.account);
     Ok(RunTerms {
         run: decode_run_name(terms.run)?,
-        layout: match terms.description {
+        task: match terms.description {
             None => decode_layout(&terms.task, terms.n_arms)?.into(),
             Some(description) => decode_described(description, &terms.task, terms.n_arms)
                 .map_err(|error| error.within("description"))?,
@@ -259,7 +259,7 @@ mod tests {
     fn terms() -> RunTerms {
         RunTerms {
             run: "run-7".to_owned(),
-            layout: LAYOUT.into(),
+            task: LAYOUT.into(),
             account: Some("run-7".to_owned()),
             advice: AdviceTerms { judged_action: JudgedAction::Policy, unit: AdviceUnit::SlotStep },
             exploration: Exploration {

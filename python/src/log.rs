@@ -80,7 +80,7 @@ struct Columns {
 impl Columns {
     /// Collects the steps of `log`. The error names what they lack.
     fn of(log: &EpisodeLog) -> Result<Self, String> {
-        let task = &log.metadata.layout;
+        let task = &log.metadata.task;
         let first = log.transitions.first().ok_or("it has no step")?;
         // The result of the last step of an incomplete log is unknown.
         let n_steps = log.transitions.len() - usize::from(log.last_observation.is_none());
@@ -151,7 +151,7 @@ fn fields<'py>(
     columns: Columns,
 ) -> PyResult<Bound<'py, PyDict>> {
     let fields = metadata_fields(py, &log.metadata)?;
-    let task = &log.metadata.layout;
+    let task = &log.metadata.task;
     let (t, n_arms) = (columns.n_steps, task.n_arms());
     let set = |name, array: PyResult<Bound<'py, PyAny>>| fields.set_item(name, array?);
     set("observation", array(py, columns.observation, &[t + 1, task.n_observation()]))?;
@@ -189,7 +189,7 @@ fn metadata_fields<'py>(
     py: Python<'py>,
     metadata: &EpisodeMetadata,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let (fields, task) = (PyDict::new(py), &metadata.layout);
+    let (fields, task) = (PyDict::new(py), &metadata.task);
     let kind = match metadata.kind {
         EpisodeKind::Training => "training",
         EpisodeKind::Evaluation => "evaluation",
@@ -222,7 +222,7 @@ fn step_s(task: &TaskSpec) -> Option<f64> {
 
 /// Returns the settings of a built-in world that this package simulates: one that does not vary.
 fn simulated_settings(metadata: &EpisodeMetadata) -> Option<WorldSettings> {
-    metadata.layout.as_built_in()?;
+    metadata.task.as_built_in()?;
     let entry = |key: &str| metadata.world.get(key).map(String::as_str);
     let settings = WorldSettings::from_log_entries(entry).ok()?.for_kind(metadata.kind);
     let is_training = metadata.kind == EpisodeKind::Training;

@@ -47,31 +47,31 @@ impl Policy {
     /// Name of the task.
     #[getter]
     fn task(&self) -> &str {
-        self.policy.layout.name()
+        self.policy.task.name()
     }
 
     /// Number of arms.
     #[getter]
     fn n_arms(&self) -> usize {
-        self.policy.layout.n_arms()
+        self.policy.task.n_arms()
     }
 
     /// Length of an observation.
     #[getter]
     fn n_observation(&self) -> usize {
-        self.policy.layout.n_observation()
+        self.policy.task.n_observation()
     }
 
     /// Length of a goal.
     #[getter]
     fn n_goal(&self) -> usize {
-        self.policy.layout.n_goal()
+        self.policy.task.n_goal()
     }
 
     /// Length of an action.
     #[getter]
     fn n_action(&self) -> usize {
-        self.policy.layout.n_action()
+        self.policy.task.n_action()
     }
 
     /// Number of values that the critic returns.
@@ -118,13 +118,13 @@ impl Policy {
         observations: PyReadonlyArray2<'py, f32>,
         goals: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        let layout = &self.policy.layout;
+        let task = &self.policy.task;
         let n_rows = observations.as_array().nrows();
-        let observations = checked(&observations, n_rows, layout.n_observation(), "observations")?;
-        let goals = checked(&goals, n_rows, layout.n_goal(), "goals")?;
-        let mut actions = vec![0.0; n_rows * layout.n_action()];
+        let observations = checked(&observations, n_rows, task.n_observation(), "observations")?;
+        let goals = checked(&goals, n_rows, task.n_goal(), "goals")?;
+        let mut actions = vec![0.0; n_rows * task.n_action()];
         py.detach(|| self.networks().actor.act(&observations, &goals, &mut actions));
-        PyArray1::from_vec(py, actions).reshape([n_rows, layout.n_action()])
+        PyArray1::from_vec(py, actions).reshape([n_rows, task.n_action()])
     }
 
     /// Returns the values, shape `[n, n_heads]`, of `actions`, shape `[n, n_action]`, for `observations` and `goals`.
@@ -138,11 +138,11 @@ impl Policy {
         if !self.policy.has_critic() {
             return Err(value_error("the policy has no critic, and so no values"));
         }
-        let layout = &self.policy.layout;
+        let task = &self.policy.task;
         let n_rows = observations.as_array().nrows();
-        let observations = checked(&observations, n_rows, layout.n_observation(), "observations")?;
-        let goals = checked(&goals, n_rows, layout.n_goal(), "goals")?;
-        let actions = checked(&actions, n_rows, layout.n_action(), "actions")?;
+        let observations = checked(&observations, n_rows, task.n_observation(), "observations")?;
+        let goals = checked(&goals, n_rows, task.n_goal(), "goals")?;
+        let actions = checked(&actions, n_rows, task.n_action(), "actions")?;
         let mut values = vec![0.0; n_rows * self.policy.n_heads];
         py.detach(|| self.networks().critic.q(&observations, &goals, &actions, &mut values));
         PyArray1::from_vec(py, values).reshape([n_rows, self.policy.n_heads])

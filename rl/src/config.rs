@@ -294,7 +294,7 @@ impl RunConfig {
     ///
     /// # Errors
     /// When the task does not exist, its description is invalid, or `task` or `arms` contradict the description.
-    pub fn layout(&self) -> Result<TaskSpec, ConfigError> {
+    pub fn task_spec(&self) -> Result<TaskSpec, ConfigError> {
         let Some(description) = &self.description else {
             let task: Task = self.task.parse()?;
             let is_count = (task.min_arms()..=MAX_ARMS).contains(&self.arms);
@@ -316,7 +316,7 @@ impl RunConfig {
     pub fn episode_steps(&self) -> usize {
         match &self.description {
             Some(description) => description.episode_steps,
-            None => self.layout().map_or(1, |task| task.episode_steps()),
+            None => self.task_spec().map_or(1, |task| task.episode_steps()),
         }
     }
 

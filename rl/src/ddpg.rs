@@ -49,15 +49,15 @@ pub struct Batch {
 impl Batch {
     /// Creates a batch of zeros, to be filled repeatedly.
     #[must_use]
-    pub fn new(layout: impl Into<TaskSpec>, n_heads: usize, batch_size: usize) -> Self {
-        let layout = layout.into();
-        let n_input = layout.n_observation() + layout.n_goal();
+    pub fn new(task: impl Into<TaskSpec>, n_heads: usize, batch_size: usize) -> Self {
+        let task = task.into();
+        let n_input = task.n_observation() + task.n_goal();
         Self {
             inputs: vec![0.0; batch_size * n_input],
-            actions: vec![0.0; batch_size * layout.n_action()],
+            actions: vec![0.0; batch_size * task.n_action()],
             rewards: vec![0.0; batch_size * n_heads],
             next_inputs: vec![0.0; batch_size * n_input],
-            bc_mask: vec![0.0; batch_size * layout.n_action()],
+            bc_mask: vec![0.0; batch_size * task.n_action()],
         }
     }
 
@@ -166,22 +166,22 @@ struct Scratch {
 }
 
 impl Ddpg {
-    /// Creates networks for `layout`, initialised from `run_seed`. The critic has one head per reward.
+    /// Creates networks for `task`, initialised from `run_seed`. The critic has one head per reward.
     #[must_use]
     pub fn new(
         config: DdpgConfig,
-        layout: impl Into<TaskSpec>,
+        task: impl Into<TaskSpec>,
         rewards: Rewards,
         run_seed: u64,
     ) -> Self {
-        let layout = layout.into();
+        let task = task.into();
         let (n_hidden, n_hidden_layers) = (config.n_hidden, config.n_hidden_layers);
         let network = |shape, number, learning_rate| {
             let mut rng = episode_rng(run_seed, number, Stream::Initialisation);
             Network::new(shape, learning_rate, &mut rng)
         };
-        let actor_shape = MlpShape::actor(&layout, n_hidden, n_hidden_layers);
-        let critic_shape = MlpShape::critic(&layout, n_hidden, n_hidden_layers, rewards.n_heads);
+        let actor_shape = MlpShape::actor(&task, n_hidden, n_hidden_layers);
+        let critic_shape = MlpShape::critic(&task, n_hidden, n_hidden_layers, rewards.n_heads);
         let row_blocks = critic_shape.row_blocks(config.transitions_per_update());
         let mut ddpg = Self {
             n_updates: 0,
@@ -189,7 +189,7 @@ impl Ddpg {
             critic: network(critic_shape, 1, config.critic_learning_rate),
             actor_update: ActorUpdate::new(&config, &actor_shape, &critic_shape),
             critic_update: CriticUpdate::new(&config, rewards.lowest, &critic_shape),
-            heads: heads_of_actions(&layout, rewards.n_heads),
+            heads: heads_of_actions(&task, rewards.n_heads),
             row_blocks,
             scratch: Vec::new(),
             config,
@@ -205,7 +205,7 @@ impl Ddpg {
     /// When a loss or a parameter is no longer finite. The networks are unusable then.
     ///
     /// # Panics
-    /// When the batch does not have [`DdpgConfig::transitions_per_update`] rows, or another layout.
+    /// When the batch does not have [`DdpgConfig::transitions_per_update`] rows, or belongs to another task.
     pub fn update(
         &mut self,
         settings: UpdateSettings,
@@ -354,11 +354,11 @@ impl Rewards {
 
 /// Returns the critic's head that values each component of an action: that of the component's arm, if every arm has a
 /// head.
-fn heads_of_actions(layout: &TaskSpec, n_heads: usize) -> Vec<Option<usize>> {
-    let mut heads = vec![None; layout.n_action()];
-    if n_heads == layout.n_arms() {
-        for arm in layout.arms() {
-            layout.action_of(arm).iter().for_each(|idx| heads[idx] = Some(arm.0));
+fn heads_of_actions(task: &TaskSpec, n_heads: usize) -> Vec<Option<usize>> {
+    let mut heads = vec![None; task.n_action()];
+    if n_heads == task.n_arms() {
+        for arm in task.arms() {
+            task.action_of(arm).iter().for_each(|idx| heads[idx] = Some(arm.0));
         }
     }
     heads

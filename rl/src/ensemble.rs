@@ -43,10 +43,10 @@ struct Member {
 }
 
 impl CriticEnsemble {
-    /// Creates critics for `layout` with `n_heads` values, initialised from `run_seed`.
+    /// Creates critics for `task` with `n_heads` values, initialised from `run_seed`.
     #[must_use]
-    pub fn new(config: &DdpgConfig, layout: &TaskSpec, n_heads: usize, run_seed: u64) -> Self {
-        let shape = MlpShape::critic(layout, N_HIDDEN, N_HIDDEN_LAYERS, n_heads);
+    pub fn new(config: &DdpgConfig, task: &TaskSpec, n_heads: usize, run_seed: u64) -> Self {
+        let shape = MlpShape::critic(task, N_HIDDEN, N_HIDDEN_LAYERS, n_heads);
         let b = config.transitions_per_update();
         let n_parameters = shape.n_parameters();
         let member = |idx| {

@@ -58,7 +58,7 @@ struct SampledTransition {
 #[derive(Debug)]
 pub struct Sampler {
     config: ReplayConfig,
-    layout: TaskSpec,
+    task: TaskSpec,
     contact_cost: f32,
     intervention_cost: f32,
     /// The transition that is being sampled or written. It trades places with an element of `samples`, so that the
@@ -71,26 +71,26 @@ pub struct Sampler {
 }
 
 impl Sampler {
-    /// Creates a sampler for episodes of `layout`.
+    /// Creates a sampler for episodes of `task`.
     #[must_use]
-    pub fn new(config: &ReplayConfig, layout: impl Into<TaskSpec>) -> Self {
-        let layout = layout.into();
+    pub fn new(config: &ReplayConfig, task: impl Into<TaskSpec>) -> Self {
+        let task = task.into();
         let sample = SampledTransition {
-            steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; layout.n_arms()],
-            goal: vec![0.0; layout.n_goal()],
-            rewards: vec![0.0; config.reward.n_heads(&layout)],
-            keeps_goal: vec![true; layout.n_arms()],
+            steps: vec![StepIndex { episode_idx: 0, step_idx: 0 }; task.n_arms()],
+            goal: vec![0.0; task.n_goal()],
+            rewards: vec![0.0; config.reward.n_heads(&task)],
+            keeps_goal: vec![true; task.n_arms()],
             swapped: false,
             reflected: false,
             has_contact: false,
         };
         let (raw_observation, raw_goal) =
-            (vec![0.0; layout.n_observation()], vec![0.0; layout.n_goal()]);
+            (vec![0.0; task.n_observation()], vec![0.0; task.n_goal()]);
         Self {
             contact_cost: config.contact_cost,
             intervention_cost: 0.0,
             config: config.clone(),
-            layout,
+            task,
             sample,
             samples: Vec::new(),
             raw_observation,
@@ -117,7 +117,7 @@ impl Sampler {
     /// `statistics`.
     ///
     /// # Panics
-    /// When the buffer is empty or the batch has another layout.
+    /// When the buffer is empty or the batch belongs to another task.
     pub fn fill(
         &mut self,
         buffer: &ReplayBuffer,
@@ -150,7 +150,7 @@ impl Sampler {
     fn sample_transition(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         self.sample_steps(buffer, rng);
         self.sample.swapped =
-            bernoulli(rng, self.config.arm_swap_prob) && self.layout.has_interchangeable_arms();
+            bernoulli(rng, self.config.arm_swap_prob) && self.task.has_interchangeable_arms();
         self.sample_reflection(buffer, rng);
         match self.config.reward {
             RewardKind::Joint => self.relabel_jointly(buffer, rng),
@@ -164,7 +164,7 @@ impl Sampler {
         self.sample.steps.fill(first);
         self.sample.has_contact = false;
         let can_combine =
-            self.config.reward == RewardKind::PerArm && self.layout.has_recombinable_arms();
+            self.config.reward == RewardKind::PerArm && self.task.has_recombinable_arms();
         if bernoulli(rng, self.config.coda_fraction) && can_combine {
             let second = self.sample_step(buffer, rng);
             if is_apart(buffer, [first, second]) {
@@ -182,14 +182,14 @@ impl Sampler {
     /// Samples whether the parts of all arms are reflected: always possible if the task's whole scene has a mirror image,
     /// otherwise only while the arms are apart.
     fn sample_reflection(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
-        if self.config.reflection_prob == 0.0 || !self.layout.has_reflection() {
+        if self.config.reflection_prob == 0.0 || !self.task.has_reflection() {
             return;
         }
         let are_independent = || match self.sample.steps[..] {
             [_] => true,
-            _ if self.layout.has_reflected_scene() => true,
+            _ if self.task.has_reflected_scene() => true,
             [first, second] => {
-                self.layout.has_recombinable_arms() && is_apart(buffer, [first, second])
+                self.task.has_recombinable_arms() && is_apart(buffer, [first, second])
             }
             _ => false,
         };
@@ -208,16 +208,16 @@ impl Sampler {
         } else {
             index(rng, buffer.n_episodes())
         };
-        StepIndex { episode_idx, step_idx: index(rng, self.layout.episode_steps()) }
+        StepIndex { episode_idx, step_idx: index(rng, self.task.episode_steps()) }
     }
 
     /// Samples each arm's goal, or one later step for all arms if they share an object, and rewards each arm.
     fn relabel_arms(&mut self, buffer: &ReplayBuffer, rng: &mut ChaCha8Rng) {
         let shared = self
-            .layout
+            .task
             .shares_object()
             .then(|| self.sample_later_step(self.sample.steps[0], buffer, rng));
-        for arm in self.layout.arms() {
+        for arm in self.task.arms() {
             let later_step = shared
                 .unwrap_or_else(|| self.sample_later_step(self.sample.steps[arm.0], buffer, rng));
             self.sample.keeps_goal[arm.0] = later_step.is_none();
@@ -226,12 +226,12 @@ impl Sampler {
                 self.relabel_common_goal(buffer, later_step);
             }
         }
-        let norm = self.layout.norm();
+        let norm = self.task.norm();
         let common = sparse_reward_within(
             self.config.goal_tolerance_m,
             norm.of_accumulated(self.common_distance(buffer)),
         );
-        for arm in self.layout.arms() {
+        for arm in self.task.arms() {
             let distance = norm.of_accumulated(self.arm_distance(buffer, arm));
             let own = sparse_reward_within(self.config.goal_tolerance_m, distance);
             let reward = if common == REWARD_ACHIEVED { own } else { common };
@@ -244,15 +244,15 @@ impl Sampler {
         let later_step = self.sample_later_step(self.sample.steps[0], buffer, rng);
         self.sample.keeps_goal.fill(later_step.is_none());
         self.relabel_common_goal(buffer, later_step);
-        let norm = self.layout.norm();
+        let norm = self.task.norm();
         let mut accumulated = 0.0;
-        for arm in self.layout.arms() {
+        for arm in self.task.arms() {
             self.relabel_goal(buffer, arm, later_step);
             accumulated = norm.combined(accumulated, self.arm_distance(buffer, arm));
         }
         accumulated = norm.combined(accumulated, self.common_distance(buffer));
         let distance = norm.of_accumulated(accumulated);
-        let costs = self.layout.arms().map(|arm| self.intervention_cost_of(buffer, arm));
+        let costs = self.task.arms().map(|arm| self.intervention_cost_of(buffer, arm));
         let cost = costs.fold(0.0, f32::max);
         self.sample.rewards[0] =
             sparse_reward_within(self.config.goal_tolerance_m, distance) - cost;
@@ -262,7 +262,7 @@ impl Sampler {
     /// next step and did not on this one, and the arm has its desired goal.
     fn intervention_cost_of(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
         let StepIndex { episode_idx, step_idx } = self.sample.steps[arm.0];
-        let is_last = step_idx + 1 == self.layout.episode_steps();
+        let is_last = step_idx + 1 == self.task.episode_steps();
         if self.intervention_cost == 0.0 || !self.sample.keeps_goal[arm.0] || is_last {
             return 0.0;
         }
@@ -273,14 +273,14 @@ impl Sampler {
 
     /// Returns the share of `arm` in the distance between the goal and what is achieved after the sampled step.
     fn arm_distance(&self, buffer: &ReplayBuffer, arm: ArmIndex) -> f32 {
-        let layout = &self.layout;
-        let parts = (layout.achieved_goal_of(arm), layout.goal_of(arm));
+        let task = &self.task;
+        let parts = (task.achieved_goal_of(arm), task.goal_of(arm));
         self.distance_of(buffer, self.sample.steps[arm.0], parts)
     }
 
     /// As [`Self::arm_distance`], for the part of the goal that is common to all arms.
     fn common_distance(&self, buffer: &ReplayBuffer) -> f32 {
-        let parts = (self.layout.common_achieved_goal(), self.layout.common_goal());
+        let parts = (self.task.common_achieved_goal(), self.task.common_goal());
         self.distance_of(buffer, self.sample.steps[0], parts)
     }
 
@@ -291,7 +291,7 @@ impl Sampler {
         (achieved, goal): (&Part, &Part),
     ) -> f32 {
         let achieved = achieved.of(buffer.observation(episode_idx, step_idx + 1));
-        self.layout.norm().accumulate(&achieved, &goal.of(&self.sample.goal))
+        self.task.norm().accumulate(&achieved, &goal.of(&self.sample.goal))
     }
 
     /// Samples the later step whose achieved goal replaces the desired one; `None` keeps the desired goal.
@@ -302,19 +302,19 @@ impl Sampler {
         rng: &mut ChaCha8Rng,
     ) -> Option<usize> {
         let observation = |step_idx| buffer.observation(episode_idx, step_idx);
-        hindsight::sample_later_step(&self.config, &self.layout, observation, step_idx, rng)
+        hindsight::sample_later_step(&self.config, &self.task, observation, step_idx, rng)
     }
 
     /// Sets `arm`'s part of the goal: to what the arm achieved before `later_step`, or to the desired goal.
     fn relabel_goal(&mut self, buffer: &ReplayBuffer, arm: ArmIndex, later_step: Option<usize>) {
-        let (achieved, part) = (self.layout.achieved_goal_of(arm), self.layout.goal_of(arm));
+        let (achieved, part) = (self.task.achieved_goal_of(arm), self.task.goal_of(arm));
         let episode_idx = self.sample.steps[arm.0].episode_idx;
         write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
     }
 
     /// As [`Self::relabel_goal`], for the part that is common to all arms.
     fn relabel_common_goal(&mut self, buffer: &ReplayBuffer, later_step: Option<usize>) {
-        let (achieved, part) = (self.layout.common_achieved_goal(), self.layout.common_goal());
+        let (achieved, part) = (self.task.common_achieved_goal(), self.task.common_goal());
         let episode_idx = self.sample.steps[0].episode_idx;
         write_goal(buffer, episode_idx, later_step, (achieved, part), &mut self.sample.goal);
     }
@@ -352,7 +352,7 @@ fn write_goal(
 fn would_touch(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
     let after = steps
         .map(|StepIndex { episode_idx, step_idx }| buffer.observation(episode_idx, step_idx + 1));
-    separation::would_touch(buffer.layout(), after)
+    separation::would_touch(buffer.task(), after)
 }
 
 /// Returns true if two arms cannot meet when they take these steps at the same time: neither step has a contact, and
@@ -368,6 +368,6 @@ fn is_apart(buffer: &ReplayBuffer, steps: [StepIndex; 2]) -> bool {
         let observations = steps.map(|StepIndex { episode_idx, step_idx }| {
             buffer.observation(episode_idx, step_idx + later)
         });
-        separation::are_apart(buffer.layout(), observations)
+        separation::are_apart(buffer.task(), observations)
     })
 }

@@ -23,26 +23,26 @@
 //! config.ddpg.n_hidden = 16;
 //! config.ddpg.batch_size = 32;
 //! let config = config.checked()?;
-//! let layout = config.layout()?;
+//! let task = config.task_spec()?;
 //!
 //! // The replay buffer stores whole episodes. A real one comes from a worker; this one is all zeros.
-//! let mut buffer = ReplayBuffer::new(&layout, config.replay.capacity_transitions);
-//! buffer.push(&Episode::zeros(&layout, 0));
+//! let mut buffer = ReplayBuffer::new(&task, config.replay.capacity_transitions);
+//! buffer.push(&Episode::zeros(&task, 0));
 //!
 //! // HER samples transitions, gives most of them a goal that their episode achieved later, and recomputes rewards.
-//! let n_heads = config.replay.reward.n_heads(&layout);
-//! let mut batch = Batch::new(&layout, n_heads, config.ddpg.transitions_per_update());
-//! let observation = NormalizerSnapshot::identity(layout.n_observation());
-//! let goal = NormalizerSnapshot::identity(layout.n_goal());
+//! let n_heads = config.replay.reward.n_heads(&task);
+//! let mut batch = Batch::new(&task, n_heads, config.ddpg.transitions_per_update());
+//! let observation = NormalizerSnapshot::identity(task.n_observation());
+//! let goal = NormalizerSnapshot::identity(task.n_goal());
 //! let statistics = Statistics { observation: &observation, goal: &goal };
 //! let mut rng = episode_rng(config.seed, 0, Stream::Replay);
-//! Sampler::new(&config.replay, &layout).fill(&buffer, statistics, &mut rng, &mut batch);
+//! Sampler::new(&config.replay, &task).fill(&buffer, statistics, &mut rng, &mut batch);
 //! assert!(batch.rewards.iter().all(|reward| *reward == 0.0), "the object rests at its goal");
 //!
 //! // One update of critic and actor, then Polyak averaging of their target networks.
 //! let rewards = Rewards { n_heads, lowest: config.replay.lowest_reward() };
 //! let settings = config.at_round(0).update;
-//! let mut ddpg = Ddpg::new(config.ddpg, &layout, rewards, config.seed);
+//! let mut ddpg = Ddpg::new(config.ddpg, &task, rewards, config.seed);
 //! let losses = ddpg.update(settings, &batch)?;
 //! ddpg.polyak();
 //! assert!(losses.critic_loss.is_finite() && ddpg.n_updates() == 1);

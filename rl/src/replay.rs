@@ -12,7 +12,7 @@ use tandem_core::{ArmIndex, Contacts, Episode, TaskSpec};
 /// Methods panic if there is no such episode, step or arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayBuffer {
-    layout: TaskSpec,
+    task: TaskSpec,
     capacity_episodes: usize,
     next: usize,
     parts: ReplayParts,
@@ -39,11 +39,11 @@ pub struct ReplayParts {
 impl ReplayBuffer {
     /// Creates an empty buffer for at most `capacity_transitions`, rounded down to whole episodes but at least one.
     #[must_use]
-    pub fn new(layout: impl Into<TaskSpec>, capacity_transitions: usize) -> Self {
-        let layout = layout.into();
-        let capacity_episodes = (capacity_transitions / layout.episode_steps()).max(1);
+    pub fn new(task: impl Into<TaskSpec>, capacity_transitions: usize) -> Self {
+        let task = task.into();
+        let capacity_episodes = (capacity_transitions / task.episode_steps()).max(1);
         Self {
-            layout,
+            task,
             capacity_episodes,
             next: 0,
             parts: ReplayParts::default(),
@@ -55,22 +55,22 @@ impl ReplayBuffer {
     /// together.
     #[must_use]
     pub fn from_parts(
-        layout: impl Into<TaskSpec>,
+        task: impl Into<TaskSpec>,
         capacity_transitions: usize,
         parts: ReplayParts,
         next: usize,
     ) -> Option<Self> {
-        let mut buffer = Self::new(layout, capacity_transitions);
-        let layout = &buffer.layout;
-        let has_arms = |arms: u8| (layout.n_arms()..8).all(|arm| arms & (1 << arm) == 0);
-        let (n, n_steps) = (parts.moved.len(), layout.episode_steps());
+        let mut buffer = Self::new(task, capacity_transitions);
+        let task = &buffer.task;
+        let has_arms = |arms: u8| (task.n_arms()..8).all(|arm| arms & (1 << arm) == 0);
+        let (n, n_steps) = (parts.moved.len(), task.episode_steps());
         // A buffer that is not full grows at its end; a full one wraps around.
         let expected_next = if n < buffer.capacity_episodes { n..n + 1 } else { 0..n };
         let fits = n <= buffer.capacity_episodes
             && expected_next.contains(&next)
             && parts.observations.len() == n * buffer.observation_stride()
-            && parts.goals.len() == n * layout.n_goal()
-            && parts.actions.len() == n * n_steps * layout.n_action()
+            && parts.goals.len() == n * task.n_goal()
+            && parts.actions.len() == n * n_steps * task.n_action()
             && parts.advised_arms.len() == n * n_steps
             && parts.contacts.len() == n * n_steps
             && parts.moved.iter().all(|moved| *moved <= 1)
@@ -91,10 +91,10 @@ impl ReplayBuffer {
         (&self.parts, self.next)
     }
 
-    /// Returns the layout of the stored episodes.
+    /// Returns the task of the stored episodes.
     #[must_use]
-    pub const fn layout(&self) -> &TaskSpec {
-        &self.layout
+    pub const fn task(&self) -> &TaskSpec {
+        &self.task
     }
 
     /// Returns the number of stored episodes.
@@ -112,9 +112,9 @@ impl ReplayBuffer {
     /// Stores an episode, in place of the oldest if the buffer is full.
     ///
     /// # Panics
-    /// When the episode has another layout.
+    /// When the episode belongs to another task.
     pub fn push(&mut self, episode: &Episode) {
-        assert_eq!(episode.layout, self.layout, "an episode of another layout");
+        assert_eq!(episode.task, self.task, "an episode of another task");
         let moved = u8::from(episode.moved());
         let contacts: Vec<u8> = episode.contacts.iter().map(|contacts| contacts.bits()).collect();
         let parts = &mut self.parts;
@@ -144,7 +144,7 @@ impl ReplayBuffer {
     /// gives the last one.
     #[must_use]
     pub fn observation(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
-        let n = self.layout.n_observation();
+        let n = self.task.n_observation();
         let start = episode_idx * self.observation_stride() + step_idx * n;
         &self.parts.observations[start..start + n]
     }
@@ -152,41 +152,41 @@ impl ReplayBuffer {
     /// Returns what `arm` has achieved before step `step_idx`, in the order of its goal.
     #[must_use]
     pub fn achieved(&self, episode_idx: usize, step_idx: usize, arm: ArmIndex) -> Cow<'_, [f32]> {
-        self.layout.achieved_goal_of(arm).of(self.observation(episode_idx, step_idx))
+        self.task.achieved_goal_of(arm).of(self.observation(episode_idx, step_idx))
     }
 
     /// Returns the desired goal of a stored episode, shape `[n_goal]`.
     #[must_use]
     pub fn goal(&self, episode_idx: usize) -> &[f32] {
-        let n = self.layout.n_goal();
+        let n = self.task.n_goal();
         &self.parts.goals[episode_idx * n..(episode_idx + 1) * n]
     }
 
     /// Returns the action executed on step `step_idx` of a stored episode, shape `[n_action]`.
     #[must_use]
     pub fn action(&self, episode_idx: usize, step_idx: usize) -> &[f32] {
-        let n = self.layout.n_action();
-        let start = (episode_idx * self.layout.episode_steps() + step_idx) * n;
+        let n = self.task.n_action();
+        let start = (episode_idx * self.task.episode_steps() + step_idx) * n;
         &self.parts.actions[start..start + n]
     }
 
     /// Returns a mask with bit `a` set if arm `a` executed the teacher's action on that step.
     #[must_use]
     pub fn advised_arms(&self, episode_idx: usize, step_idx: usize) -> u8 {
-        self.parts.advised_arms[episode_idx * self.layout.episode_steps() + step_idx]
+        self.parts.advised_arms[episode_idx * self.task.episode_steps() + step_idx]
     }
 
     /// Returns true if an arm touched the other or the table on one of the steps of a stored episode.
     #[must_use]
     pub fn has_contact(&self, steps: Range<usize>, episode_idx: usize) -> bool {
-        let start = episode_idx * self.layout.episode_steps();
+        let start = episode_idx * self.task.episode_steps();
         self.parts.contacts[start + steps.start..start + steps.end].iter().any(|bits| *bits != 0)
     }
 
     /// Returns the contacts during a step of a stored episode.
     #[must_use]
     pub fn contacts(&self, episode_idx: usize, step_idx: usize) -> Contacts {
-        let bits = self.parts.contacts[episode_idx * self.layout.episode_steps() + step_idx];
+        let bits = self.parts.contacts[episode_idx * self.task.episode_steps() + step_idx];
         Contacts::from_bits(bits).unwrap_or(Contacts::NONE)
     }
 
@@ -197,7 +197,7 @@ impl ReplayBuffer {
     }
 
     fn observation_stride(&self) -> usize {
-        (self.layout.episode_steps() + 1) * self.layout.n_observation()
+        (self.task.episode_steps() + 1) * self.task.n_observation()
     }
 
     fn index_episodes(&mut self) {
@@ -225,15 +225,15 @@ pub(crate) mod fixtures {
     /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x, and everything else is
     /// zero.
     pub(crate) fn drifting_episode(
-        layout: impl Into<TaskSpec>,
+        task: impl Into<TaskSpec>,
         number: u64,
         drift_m: f32,
     ) -> Episode {
-        let layout = layout.into();
-        let mut episode = Episode::zeros(&layout, number);
-        let x = layout.achieved_goal_of(ArmIndex(0)).index(0);
+        let task = task.into();
+        let mut episode = Episode::zeros(&task, number);
+        let x = task.achieved_goal_of(ArmIndex(0)).index(0);
         let mut position = 0.0;
-        for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
+        for observation in episode.observations.chunks_exact_mut(task.n_observation()) {
             observation[x] = position;
             position += drift_m;
         }

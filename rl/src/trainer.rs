@@ -63,7 +63,7 @@ pub struct Trainer {
     /// The run's settings, checked.
     pub config: RunConfig,
     /// The task, from the settings.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// The run's counters.
     pub counters: Counters,
     /// The replay buffer.
@@ -91,28 +91,28 @@ impl Trainer {
     /// When a setting is out of its range.
     pub fn new(config: RunConfig) -> Result<Self, ConfigError> {
         let config = config.checked()?;
-        let layout = config.layout()?;
-        let n_heads = config.replay.reward.n_heads(&layout);
-        let mut sampler = Sampler::new(&config.replay, &layout);
+        let task = config.task_spec()?;
+        let n_heads = config.replay.reward.n_heads(&task);
+        let mut sampler = Sampler::new(&config.replay, &task);
         sampler.set_intervention_cost(config.advice.intervention_cost());
         let lowest = config.replay.lowest_reward() - config.advice.intervention_cost();
         let rewards = Rewards { n_heads, lowest };
         let ensemble = config
             .advice
             .disagreement_threshold()
-            .map(|_threshold| CriticEnsemble::new(&config.ddpg, &layout, n_heads, config.seed));
+            .map(|_threshold| CriticEnsemble::new(&config.ddpg, &task, n_heads, config.seed));
         Ok(Self {
             counters: Counters::default(),
-            replay: ReplayBuffer::new(&layout, config.replay.capacity_transitions),
-            ddpg: Ddpg::new(config.ddpg.clone(), &layout, rewards, config.seed),
-            observation_normalizer: Normalizer::new(layout.n_observation()),
-            goal_normalizer: Normalizer::new(layout.n_goal()),
+            replay: ReplayBuffer::new(&task, config.replay.capacity_transitions),
+            ddpg: Ddpg::new(config.ddpg.clone(), &task, rewards, config.seed),
+            observation_normalizer: Normalizer::new(task.n_observation()),
+            goal_normalizer: Normalizer::new(task.n_goal()),
             jump_start: config.advice.horizon().map(JumpStart::new),
             ensemble,
             sampler,
-            batch: Batch::new(&layout, n_heads, config.ddpg.transitions_per_update()),
+            batch: Batch::new(&task, n_heads, config.ddpg.transitions_per_update()),
             stats: RoundStats::default(),
-            layout,
+            task,
             config,
         })
     }
@@ -123,26 +123,26 @@ impl Trainer {
     /// # Errors
     /// Describes the mismatch: the teacher's task, arms or sizes, or a critic with one head for several arms.
     pub fn start_from(&mut self, teacher: &Policy) -> Result<(), String> {
-        let (task, n_arms) = (self.layout.name(), teacher.layout.n_arms());
-        let Some(one_arm) = self.layout.single_arm() else {
+        let (task, n_arms) = (self.task.name(), teacher.task.n_arms());
+        let Some(one_arm) = self.task.single_arm() else {
             return Err(format!("the arms of {task} are not instances of one task of one arm"));
         };
-        if teacher.layout.name() != one_arm.name() || n_arms != 1 || teacher.n_heads != 1 {
+        if teacher.task.name() != one_arm.name() || n_arms != 1 || teacher.n_heads != 1 {
             return Err(format!(
                 "needs a teacher for {} with one arm and one value, got {} for {} with {}",
                 one_arm.name(),
                 counted(n_arms, "arm"),
-                teacher.layout.name(),
+                teacher.task.name(),
                 counted(teacher.n_heads, "value")
             ));
         }
-        if let Some(difference) = one_arm.difference(&teacher.layout) {
+        if let Some(difference) = one_arm.difference(&teacher.task) {
             return Err(format!("needs a teacher for one arm of {task}, whose {difference}"));
         }
-        let copies = teacher.replicated(&self.layout);
+        let copies = teacher.replicated(&self.task);
         let sizes = |policy: &Policy| (policy.n_hidden, policy.n_hidden_layers, policy.n_heads);
         let ddpg = &self.config.ddpg;
-        let n_heads = self.config.replay.reward.n_heads(&self.layout);
+        let n_heads = self.config.replay.reward.n_heads(&self.task);
         if sizes(&copies) != (ddpg.n_hidden, ddpg.n_hidden_layers, n_heads) {
             return Err(format!(
                 "needs ddpg.n_hidden = {}, ddpg.n_hidden_layers = {} and replay.reward = \"per-arm\" to hold this teacher's \
@@ -184,7 +184,7 @@ impl Trainer {
     /// Adds a round's episodes, in episode order, to the replay buffer, the normalisers and the counters.
     ///
     /// # Panics
-    /// When an episode has another layout.
+    /// When an episode belongs to another task.
     pub fn ingest(&mut self, episodes: &[Episode]) {
         for episode in episodes {
             self.replay.push(episode);
@@ -193,7 +193,7 @@ impl Trainer {
             self.counters.advice_queries += u64::from(episode.queried_steps.unwrap_or(0));
         }
         self.counters.episodes += episodes.len() as u64;
-        self.counters.env_steps += (episodes.len() * self.layout.episode_steps()) as u64;
+        self.counters.env_steps += (episodes.len() * self.task.episode_steps()) as u64;
         let share = |hits: usize| hits as f64 / episodes.len().max(1) as f64;
         self.stats.training_success =
             share(episodes.iter().filter(|episode| episode.succeeded()).count());
@@ -223,13 +223,13 @@ impl Trainer {
     /// world can produce. Inputs normalised with it are indistinguishable, so the policy cannot learn.
     #[must_use]
     pub fn implausible_statistic(&self) -> Option<String> {
-        let layout = &self.layout;
+        let task = &self.task;
         let goal_bound = |idx: usize| {
-            let achieved = layout.description().achieved_goal[idx];
-            layout.goal_bound(idx).max(layout.observation_bound(achieved))
+            let achieved = task.description().achieved_goal[idx];
+            task.goal_bound(idx).max(task.observation_bound(achieved))
         };
         let observation = self.observation_normalizer.snapshot();
-        first_implausible("observations", observation, |idx| layout.observation_bound(idx))
+        first_implausible("observations", observation, |idx| task.observation_bound(idx))
             .or_else(|| first_implausible("goals", self.goal_normalizer.snapshot(), goal_bound))
     }
 
@@ -312,10 +312,10 @@ impl Trainer {
             Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
         };
         Policy {
-            layout: self.layout.clone(),
+            task: self.task.clone(),
             n_hidden: self.config.ddpg.n_hidden,
             n_hidden_layers: self.config.ddpg.n_hidden_layers,
-            n_heads: self.config.replay.reward.n_heads(&self.layout),
+            n_heads: self.config.replay.reward.n_heads(&self.task),
             actor: actor.to_vec(),
             critic: critic.to_vec(),
             observation_normalizer: self.observation_normalizer.snapshot().clone(),
@@ -377,10 +377,10 @@ impl Trainer {
     fn update_normalizers(&mut self, episode: &Episode) {
         let mut rng = episode_rng(self.config.seed, episode.number, Stream::Normaliser);
         let replay = &self.config.replay;
-        let both_orders = replay.arm_swap_prob > 0.0 && self.layout.has_interchangeable_arms();
+        let both_orders = replay.arm_swap_prob > 0.0 && self.task.has_interchangeable_arms();
         let (mut observations, mut goals) = (Vec::new(), Vec::new());
         for step_idx in 0..episode.n_steps() {
-            let goal = relabelled_goal(replay, &self.layout, episode, step_idx, &mut rng);
+            let goal = relabelled_goal(replay, &self.task, episode, step_idx, &mut rng);
             let observation = episode.observation(step_idx);
             observations.extend_from_slice(observation);
             goals.extend_from_slice(&goal);
@@ -395,9 +395,9 @@ impl Trainer {
 
     /// Returns a vector in which the parts of the arms have the reverse order.
     fn swapped(&self, vector: &[f32], part_of: fn(&TaskSpec, ArmIndex) -> &Part) -> Vec<f32> {
-        let (layout, mut swapped) = (&self.layout, vector.to_vec());
-        for (to, from) in arm_sources(layout.n_arms(), true) {
-            part_of(layout, to).copy_from(&mut swapped, part_of(layout, from), vector);
+        let (task, mut swapped) = (&self.task, vector.to_vec());
+        for (to, from) in arm_sources(task.n_arms(), true) {
+            part_of(task, to).copy_from(&mut swapped, part_of(task, from), vector);
         }
         swapped
     }

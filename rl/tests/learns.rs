@@ -49,7 +49,7 @@ fn play(actor: &mut Actor, order: EpisodeOrder, noise_std: f32) -> Episode {
         number: order.number,
         kind: EpisodeKind::Training,
         parameter_version: 0,
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         observations,
         goal,
         actions,

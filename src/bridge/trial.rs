@@ -137,11 +137,11 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
     for path in &args.policies {
         let file = policy_file::file_of(path)?;
         let policy = policy_file::load(&file)?;
-        if policy.layout.n_arms() != 2 {
+        if policy.task.n_arms() != 2 {
             return Err(Failed::usage(format!(
                 "{} drives {}, the bridge has 2: a one-arm policy goes with --composed-teachers",
                 path.display(),
-                counted(policy.layout.n_arms(), "arm")
+                counted(policy.task.n_arms(), "arm")
             )));
         }
         policies.push(NamedPolicy { name: name_of(&file), policy });
@@ -149,11 +149,11 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
     for path in &args.composed_teachers {
         let file = policy_file::file_of(path)?;
         let policy = policy_file::load(&file)?;
-        if policy.layout.n_arms() != 1 {
+        if policy.task.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{} drives {} arms: a teacher drives one",
                 path.display(),
-                policy.layout.n_arms()
+                policy.task.n_arms()
             )));
         }
         policies.push(NamedPolicy { name: format!("composed-{}", name_of(&file)), policy });
@@ -166,9 +166,9 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
         )));
     }
     let own_task = |named: &NamedPolicy| {
-        let built_in = named.policy.layout.as_built_in().map(|layout| layout.task);
+        let built_in = named.policy.task.as_built_in().map(|layout| layout.task);
         built_in.ok_or_else(|| {
-            let (name, task) = (&named.name, named.policy.layout.name());
+            let (name, task) = (&named.name, named.policy.task.name());
             Failed::usage(format!("{name} is for {task}, which simulated arms cannot perform"))
         })
     };
@@ -190,7 +190,7 @@ fn policies(args: &TrialArgs) -> Result<(Task, Vec<NamedPolicy>), Failed> {
 /// Returns the task in which a policy whose own task is `own` is tried: `wanted` if it performs the part of one arm of that,
 /// otherwise its own.
 fn task_of(named: &NamedPolicy, own: Task, wanted: Option<Task>) -> Task {
-    let is_composed = named.policy.layout.n_arms() == 1;
+    let is_composed = named.policy.task.n_arms() == 1;
     wanted.filter(|wanted| is_composed && wanted.of_one_arm() == own).unwrap_or(own)
 }
 

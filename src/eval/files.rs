@@ -144,7 +144,7 @@ fn films(layout: Layout, seed: u64, episodes: &[Episode]) -> Result<Vec<FilmEpis
 fn terms(subject: &EvaluatedPolicy) -> RunTerms {
     RunTerms {
         run: String::new(),
-        layout: subject.layout().into(),
+        task: subject.layout().into(),
         account: None,
         advice: AdviceTerms::default(),
         exploration: Exploration::NONE,

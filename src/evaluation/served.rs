@@ -110,7 +110,7 @@ fn check_task(part: Part, policy: &Policy, served: &ServedTask) -> Result<(), Fa
             }
         },
     };
-    match policy.layout.difference(&task) {
+    match policy.task.difference(&task) {
         Some(difference) => Err(Failed::usage(format!(
             "the environment server {server} serves another task than the policy's: {} is {} in the policy and {} for \
              {of_server}the server's task",

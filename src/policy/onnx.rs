@@ -6,7 +6,7 @@ use serde_json::json;
 use tandem_core::rng::uniform;
 use tandem_core::task::Norm;
 use tandem_core::{Layout, Stream, TaskSpec, episode_rng};
-use tandem_onnx::binding::{check_pair, layout_of, names_task};
+use tandem_onnx::binding::{check_pair, names_task, task_of};
 use tandem_onnx::import::check as check_representable;
 use tandem_onnx::model::digest;
 use tandem_onnx::{
@@ -71,14 +71,14 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     let critic = args.critic.as_deref().map(Model::load).transpose();
     let critic = critic.or_exit(Exit::Data, String::new)?;
     let refused = |source| refused(&args.actor, source);
-    let layout = layout(args, &actor)?;
+    let task = task_of_import(args, &actor)?;
     // The critic alone is checked first, so that an error names its file.
     if let Some((critic, path)) = critic.as_ref().zip(args.critic.as_ref()) {
         let checked = check_pair(&actor, critic);
-        let checked = checked.and_then(|()| check_representable(critic, Role::Critic, &layout));
+        let checked = checked.and_then(|()| check_representable(critic, Role::Critic, &task));
         checked.map_err(|source| self::refused(path, source))?;
     }
-    let policy = convert(&actor, critic.as_ref(), &layout).map_err(refused)?;
+    let policy = convert(&actor, critic.as_ref(), &task).map_err(refused)?;
     let differences = compare(&policy, &actor, critic.as_ref()).map_err(refused)?;
     if differences.iter().any(|difference| difference.is_nan() || *difference > TOLERANCE) {
         return Err(Failed::new(
@@ -95,13 +95,12 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
         .or_cannot_write(|| format!("cannot write {}", args.out.display()))?;
     if args.json {
         return output::print(json!({
-            "file": args.out.to_string_lossy(), "task": layout.name(), "arms": layout.n_arms(), "digest": policy.digest(),
+            "file": args.out.to_string_lossy(), "task": task.name(), "arms": task.n_arms(), "digest": policy.digest(),
             "has_critic": policy.has_critic(), "action_difference": differences[0], "value_difference": differences[1],
         }));
     }
-    let (task, n_arms) = (layout.name(), layout.n_arms());
     output::print(format_args!("policy        {}", args.out.display()))?;
-    output::print(format_args!("task          {task}, arms {n_arms}"))?;
+    output::print(format_args!("task          {}, arms {}", task.name(), task.n_arms()))?;
     output::print(format_args!("digest        {}", policy.digest()))?;
     let values = match policy.has_critic() {
         true => format!(", values by {:.1e}", differences[1]),
@@ -114,8 +113,8 @@ pub(super) fn import(args: &ImportArgs) -> Result<(), Failed> {
     ))
 }
 
-/// Returns the layout that the arguments name, or else the one that the model names or fits.
-fn layout(args: &ImportArgs, actor: &Model) -> Result<TaskSpec, Failed> {
+/// Returns the task that the arguments name, or else the one that the model names or fits.
+fn task_of_import(args: &ImportArgs, actor: &Model) -> Result<TaskSpec, Failed> {
     if let (Some(task), Some(n_arms)) = (args.task, args.arms) {
         let task = task.in_named_world(args.world)?;
         if usize::from(n_arms) < task.min_arms() {
@@ -126,7 +125,7 @@ fn layout(args: &ImportArgs, actor: &Model) -> Result<TaskSpec, Failed> {
     if let Some(served) = served_task::of_server(&args.environment)? {
         return Ok(served.task);
     }
-    layout_of(actor, Role::Actor).map_err(|source| {
+    task_of(actor, Role::Actor).map_err(|source| {
         let failed = refused(&args.actor, source);
         if names_task(actor) { failed } else { failed.context(UNKNOWN_TASK.to_owned()) }
     })
@@ -139,22 +138,22 @@ fn refused(path: &Path, source: ModelError) -> Failed {
 
 /// Returns the largest differences of actions and of values between a policy and its models in random states.
 fn compare(policy: &Policy, actor: &Model, critic: Option<&Model>) -> Result<[f32; 2], ModelError> {
-    let layout = &policy.layout;
+    let task = &policy.task;
     let mut rng = episode_rng(0, 0, Stream::Reset);
     let mut draw = |n: usize, most: f32| -> Vec<f32> {
         (0..N_COMPARED * n).map(|_| uniform(&mut rng, -most, most)).collect()
     };
-    let (observations, goals) = (draw(layout.n_observation(), 0.5), draw(layout.n_goal(), 0.5));
-    let proposed = draw(layout.n_action(), 1.0);
+    let (observations, goals) = (draw(task.n_observation(), 0.5), draw(task.n_goal(), 0.5));
+    let proposed = draw(task.n_action(), 1.0);
     let mut expected = vec![0.0; proposed.len()];
     let mut got = expected.clone();
-    BoundNetwork::new(actor, Role::Actor, layout)?.run(&observations, &goals, &[], &mut expected);
+    BoundNetwork::new(actor, Role::Actor, task)?.run(&observations, &goals, &[], &mut expected);
     policy.actor()?.act(&observations, &goals, &mut got);
     let action_difference = largest_difference(&got, &expected);
     let Some(critic) = critic else { return Ok([action_difference, 0.0]) };
     let mut expected = vec![0.0; N_COMPARED * policy.n_heads];
     let mut got = expected.clone();
-    let mut bound = BoundNetwork::new(critic, Role::Critic, layout)?;
+    let mut bound = BoundNetwork::new(critic, Role::Critic, task)?;
     bound.run(&observations, &goals, &proposed, &mut expected);
     policy.critic()?.q(&observations, &goals, &proposed, &mut got);
     Ok([action_difference, largest_difference(&got, &expected)])

@@ -5,7 +5,7 @@ use std::fmt::Display;
 use std::path::Path;
 
 use serde_json::json;
-use tandem_onnx::binding::layout_of;
+use tandem_onnx::binding::task_of;
 use tandem_onnx::network::{Op, Step};
 use tandem_onnx::{BoundNetwork, Model, Network, Role};
 use tandem_teacher::policy::is_onnx;
@@ -20,11 +20,11 @@ pub(super) fn show(args: &ShowArgs) -> Result<(), Failed> {
 
 fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&args.file)?;
-    let described = policy.layout.as_built_in().is_none();
-    let description = described.then(|| json!(policy.layout.description()));
+    let described = policy.task.as_built_in().is_none();
+    let description = described.then(|| json!(policy.task.description()));
     if args.json {
         let mut shown = json!({
-            "task": policy.layout.name(), "arms": policy.layout.n_arms(), "n_hidden": policy.n_hidden,
+            "task": policy.task.name(), "arms": policy.task.n_arms(), "n_hidden": policy.n_hidden,
             "n_hidden_layers": policy.n_hidden_layers, "critic_heads": policy.n_heads, "digest": policy.digest(),
             "metadata": policy.metadata,
         });
@@ -33,8 +33,8 @@ fn show_policy(args: &ShowArgs) -> Result<(), Failed> {
         }
         return output::print(shown);
     }
-    line("task", policy.layout.name())?;
-    line("arms", policy.layout.n_arms())?;
+    line("task", policy.task.name())?;
+    line("arms", policy.task.n_arms())?;
     let (n_layers, n_hidden, n_heads) = (policy.n_hidden_layers, policy.n_hidden, policy.n_heads);
     let critic = match policy.has_critic() {
         true => format!("critic heads {n_heads}"),
@@ -54,16 +54,16 @@ fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
     let inputs = network.inputs.iter();
     let fit =
         [(Role::Actor, "actor"), (Role::Critic, "critic")].into_iter().find_map(|(role, name)| {
-            let layout = layout_of(&model, role).ok()?;
-            BoundNetwork::new(&model, role, &layout).is_ok().then_some((name, layout))
+            let task = task_of(&model, role).ok()?;
+            BoundNetwork::new(&model, role, &task).is_ok().then_some((name, task))
         });
     if as_json {
         let inputs: Vec<_> =
             inputs.map(|input| json!({ "name": input.name, "width": input.width })).collect();
         return output::print(json!({
             "role": fit.as_ref().map(|(name, _)| name),
-            "task": fit.as_ref().map(|(_, layout)| layout.name()),
-            "arms": fit.as_ref().map(|(_, layout)| layout.n_arms()),
+            "task": fit.as_ref().map(|(_, task)| task.name()),
+            "arms": fit.as_ref().map(|(_, task)| task.n_arms()),
             "inputs": inputs,
             "output": { "name": network.output, "width": network.n_output },
             "layers": layers(network),
@@ -73,9 +73,8 @@ fn show_model(file: &Path, as_json: bool) -> Result<(), Failed> {
         }));
     }
     match fit {
-        Some((name, layout)) => {
-            let (task, n_arms) = (layout.name(), layout.n_arms());
-            line("fits", format_args!("{name} for {task}, arms {n_arms}"))?;
+        Some((name, task)) => {
+            line("fits", format_args!("{name} for {}, arms {}", task.name(), task.n_arms()))?;
         }
         None => line("fits", "no task")?,
     }

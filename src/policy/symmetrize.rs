@@ -13,8 +13,8 @@ pub(super) fn symmetrize(args: &SymmetrizeArgs) -> Result<(), Failed> {
     let policy = policy_file::load(&file)?;
     let refusal = if policy.is_symmetrized() {
         Some("the policy is symmetrised already".to_owned())
-    } else if !policy.layout.has_interchangeable_arms() {
-        let (task, n_arms) = (policy.layout.name(), policy.layout.n_arms());
+    } else if !policy.task.has_interchangeable_arms() {
+        let (task, n_arms) = (policy.task.name(), policy.task.n_arms());
         Some(format!("the arms of {task}, arms {n_arms}, are not interchangeable"))
     } else {
         None

@@ -15,7 +15,7 @@ const ARM_COLUMNS: usize = 26;
 /// Prints the steps of the log `file`, and whether the episode succeeded.
 pub(super) fn print(file: &Path) -> Result<(), Failed> {
     let log = read_episode(file).or_exit(Exit::Data, String::new)?;
-    let task = &log.metadata.layout;
+    let task = &log.metadata.task;
     output::print(format_args!("episode {} of {}", log.metadata.episode, file.display()))?;
     output::print(format_args!(
         "task {}, {}, tolerance {}{}",

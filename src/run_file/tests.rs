@@ -46,7 +46,7 @@ fn described() -> String {
 #[test]
 fn a_described_task_has_its_own_defaults_and_survives_the_file() {
     let config = from_text(&described()).expect("valid");
-    let task = config.layout().expect("valid");
+    let task = config.task_spec().expect("valid");
     assert_eq!((task.name(), task.n_arms(), task.episode_steps()), ("lab/shove", 2, 20));
     assert_eq!(task.as_built_in(), None);
     assert_eq!((config.replay.contact_cost, config.replay.arm_swap_prob), (0.0, 0.5));

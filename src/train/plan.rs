@@ -230,7 +230,7 @@ fn named_config(
 
 /// Rejects a task that neither the server nor the simulator has, and a server with too few environments for a slot.
 fn check_environment(config: &RunConfig, served: Option<&ServedTask>) -> Result<(), Failed> {
-    let task = config.layout().or_exit(Exit::Usage, String::new)?;
+    let task = config.task_spec().or_exit(Exit::Usage, String::new)?;
     match served {
         Some(served) => {
             served.check(&task).map_err(worker_failed)?;

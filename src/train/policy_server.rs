@@ -26,7 +26,7 @@ pub(super) struct PolicyServer {
 /// The policy of a server that answers.
 pub(super) struct ServedPolicy {
     pub(super) server: PolicyServer,
-    pub(super) layout: TaskSpec,
+    pub(super) task: TaskSpec,
     pub(super) has_values: bool,
 }
 
@@ -69,7 +69,7 @@ impl ServedPolicy {
         let (address, digest) = (address.to_owned(), policy.digest().to_owned());
         Ok(Self {
             server: PolicyServer { address, digest },
-            layout: policy.layout().clone(),
+            task: policy.task().clone(),
             has_values: policy.has_values(),
         })
     }

@@ -28,7 +28,7 @@ pub(crate) struct TeacherFile {
     path: PathBuf,
     critic: Option<PathBuf>,
     digest: String,
-    layout: TaskSpec,
+    task: TaskSpec,
     has_values: bool,
     source: Source,
 }
@@ -48,7 +48,7 @@ pub(crate) fn path_of_new_run(named: Option<&Path>, config: &RunConfig) -> Resul
     if let Some(path) = named {
         return Ok(path.to_owned());
     }
-    let one_arm = config.layout().ok().and_then(|layout| layout.single_arm());
+    let one_arm = config.task_spec().ok().and_then(|task| task.single_arm());
     let task = one_arm.as_ref().map_or(config.task.as_str(), TaskSpec::name);
     policy_file::shipped_teacher_of(config.recipe, task)
 }
@@ -65,10 +65,10 @@ impl TeacherFile {
     pub(crate) fn load(path: PathBuf, critic: Option<PathBuf>) -> Result<Self, Failed> {
         if is_onnx(&path) && policy_address(&path).is_none() {
             let models = OnnxPolicy::load(&path, critic.as_deref()).map_err(teacher_failed)?;
-            let (digest, layout) = (models.digest().to_owned(), models.layout());
+            let (digest, task) = (models.digest().to_owned(), models.task());
             let has_values = models.has_values();
             let source = Source::Models { names_task: models.names_task() };
-            return Ok(Self { path, critic, digest, layout, has_values, source });
+            return Ok(Self { path, critic, digest, task, has_values, source });
         }
         if critic.is_some() {
             return Err(teacher_failed(Error::SurplusCritic));
@@ -78,14 +78,14 @@ impl TeacherFile {
         }
         let path = policy_file::file_of(&path)?.into_owned();
         let policy = policy_file::load(&path)?;
-        let (digest, layout) = (policy.digest(), policy.layout.clone());
+        let (digest, task) = (policy.digest(), policy.task.clone());
         let (has_values, source) = (policy.has_critic(), Source::Policy(policy));
-        Ok(Self { path, critic, digest, layout, has_values, source })
+        Ok(Self { path, critic, digest, task, has_values, source })
     }
 
-    fn served(ServedPolicy { server, layout, has_values }: ServedPolicy) -> Self {
+    fn served(ServedPolicy { server, task, has_values }: ServedPolicy) -> Self {
         let (path, digest) = (PathBuf::from(&server.address), server.digest.clone());
-        Self { path, critic: None, digest, layout, has_values, source: Source::Server(server) }
+        Self { path, critic: None, digest, task, has_values, source: Source::Server(server) }
     }
 
     /// Loads the copy in `directory`, if there is one. A server must still have the policy of the run.
@@ -154,27 +154,27 @@ impl TeacherFile {
     /// Refuses a teacher that cannot advise the run of `config`.
     pub(crate) fn check(&self, config: &RunConfig) -> Result<(), Failed> {
         let shown = self.path.display();
-        if self.layout.n_arms() != 1 {
+        if self.task.n_arms() != 1 {
             return Err(Failed::usage(format!(
                 "{shown} drives {} arms: a teacher drives one",
-                self.layout.n_arms()
+                self.task.n_arms()
             )));
         }
-        let one_arm = config.layout().or_exit(Exit::Usage, String::new)?.single_arm();
+        let one_arm = config.task_spec().or_exit(Exit::Usage, String::new)?.single_arm();
         let wanted = one_arm.as_ref().map_or(config.task.as_str(), TaskSpec::name);
-        if self.layout.name() != wanted {
+        if self.task.name() != wanted {
             let needed = match wanted == config.task {
                 true => String::new(),
                 false => format!(", which needs one for {wanted}"),
             };
             return Err(Failed::usage(format!(
                 "{shown} is a teacher for {}, the run is for {}{needed}{}",
-                self.layout.name(),
+                self.task.name(),
                 config.task,
                 self.advice_on_task()
             )));
         }
-        if let Some(difference) = one_arm.and_then(|task| task.difference(&self.layout)) {
+        if let Some(difference) = one_arm.and_then(|task| task.difference(&self.task)) {
             return Err(Failed::usage(format!(
                 "{shown} is a teacher for another task {:?} than the run's: {difference}",
                 config.task

@@ -38,7 +38,7 @@ pub struct Advisor {
 #[derive(Debug, Clone, PartialEq)]
 pub struct TeacherInfo {
     /// The task of the policy, of one arm.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// The tasks of students with 1, 2, … arms, in arm order; see [`TaskSpec::concatenated`].
     pub students: Vec<TaskSpec>,
     /// The digest of the policy.
@@ -74,18 +74,18 @@ impl Advisor {
     /// When the policy is not for one arm, or its task has numbers that belong to no arm.
     pub fn new(policy: impl Into<AnyPolicy>, ledger: Box<dyn Ledger>) -> Result<Self, Error> {
         let policy = policy.into();
-        let layout = policy.layout();
-        if layout.n_arms() != 1 {
-            let (policy, n_arms) = ("this one".to_owned(), layout.n_arms());
+        let task = policy.task();
+        if task.n_arms() != 1 {
+            let (policy, n_arms) = ("this one".to_owned(), task.n_arms());
             return Err(Error::NotOneArm { policy, n_arms });
         }
-        layout.concatenated(1).map_err(Error::NotAnArm)?;
+        task.concatenated(1).map_err(Error::NotAnArm)?;
         let info = TeacherInfo {
             digest: policy.digest().to_owned(),
             has_values: policy.has_values(),
-            maps: Maps::new(&layout, MAX_ARMS),
-            students: (1..=MAX_ARMS).map_while(|n_arms| layout.concatenated(n_arms).ok()).collect(),
-            layout,
+            maps: Maps::new(&task, MAX_ARMS),
+            students: (1..=MAX_ARMS).map_while(|n_arms| task.concatenated(n_arms).ok()).collect(),
+            task,
         };
         let inference = TeacherInference::new(policy);
         Ok(Self {
@@ -178,11 +178,11 @@ impl Advisor {
     /// policy cannot be evaluated or returns a number that is not finite, or the ledger cannot be used.
     ///
     /// # Panics
-    /// When a query's lengths match no layout of the teacher's task with 1 to [`MAX_ARMS`] arms, or the ledger does not
-    /// answer every charge.
+    /// When a query's lengths do not fit the teacher's task with any number of arms from 1 to [`MAX_ARMS`], or the ledger
+    /// does not answer every charge.
     pub fn advise(&mut self, requests: &[AdviceRequest]) -> Vec<Result<Advice, Error>> {
         let scored = self.score(requests);
-        let episode_steps = episode_steps(&self.info.layout);
+        let episode_steps = episode_steps(&self.info.task);
         let charges: Vec<ChargeRequest> = scored
             .iter()
             .flatten()
@@ -374,7 +374,7 @@ impl ScoredRequest<'_> {
         charged: Result<ChargeResult, LedgerError>,
     ) -> Result<Advice, Error> {
         let (queries, maps) = (&self.request.queries, &info.maps);
-        let n_steps = episode_steps(&info.layout);
+        let n_steps = episode_steps(&info.task);
         let indices = charge_indices(queries);
         let charged = charged.map_err(|error| with_step(error, queries, &indices, n_steps))?;
         let n_charges = indices.iter().max().map_or(0, |last| last + 1);

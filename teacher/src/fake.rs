@@ -11,7 +11,7 @@ pub(crate) struct FakePolicy;
 const LAYOUT: Layout = Layout::new(Task::Push, 1);
 
 impl TeacherPolicy for FakePolicy {
-    fn layout(&self) -> TaskSpec {
+    fn task(&self) -> TaskSpec {
         LAYOUT.into()
     }
 

@@ -18,7 +18,7 @@ pub struct ArmMap {
     pub action: Range<usize>,
 }
 
-/// The maps between a student's layout and the teacher's, arm by arm.
+/// The maps between a student's vectors and the teacher's, arm by arm.
 ///
 /// A student with fewer arms uses the first ones. The length of its vectors determines the number of its arms.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -17,10 +17,10 @@ pub use onnx::OnnxPolicy;
 const ONNX_EXTENSION: &str = "onnx";
 
 /// A policy for one arm with an actor and, unless it has no values, a critic. Rows are states of one arm. Callers pass
-/// vectors whose lengths fit the [task](Self::layout).
+/// vectors whose lengths fit the [task](Self::task).
 pub trait TeacherPolicy: Send {
     /// Returns the task, of one arm.
-    fn layout(&self) -> TaskSpec;
+    fn task(&self) -> TaskSpec;
 
     /// Returns the text that identifies the policy: the SHA-256, hexadecimal, of its parameters or files.
     fn digest(&self) -> &str;
@@ -50,10 +50,10 @@ pub enum AnyPolicy {
 impl AnyPolicy {
     /// Returns the task, of one arm.
     #[must_use]
-    pub fn layout(&self) -> TaskSpec {
+    pub fn task(&self) -> TaskSpec {
         match self {
-            Self::Local(policy) => policy.layout(),
-            Self::Remote(policy) => policy.layout().clone(),
+            Self::Local(policy) => policy.task(),
+            Self::Remote(policy) => policy.task().clone(),
         }
     }
 
@@ -169,7 +169,7 @@ impl OneArmPolicy {
 
     /// Prepares a policy that errors call `name`.
     fn of(policy: &Policy, name: String) -> Result<Self, Error> {
-        let (n_arms, n_values) = (policy.layout.n_arms(), policy.n_heads);
+        let (n_arms, n_values) = (policy.task.n_arms(), policy.n_heads);
         if n_arms != 1 {
             return Err(Error::NotOneArm { policy: name, n_arms });
         }
@@ -187,8 +187,8 @@ impl OneArmPolicy {
 }
 
 impl TeacherPolicy for OneArmPolicy {
-    fn layout(&self) -> TaskSpec {
-        self.actor.layout().clone()
+    fn task(&self) -> TaskSpec {
+        self.actor.task().clone()
     }
 
     fn digest(&self) -> &str {
@@ -229,7 +229,7 @@ mod tests {
             critic: Vec::new(),
             observation_normalizer: identity(layout.n_observation()),
             goal_normalizer: identity(layout.n_goal()),
-            layout: layout.into(),
+            task: layout.into(),
             metadata: BTreeMap::new(),
         };
         policy.actor = vec![weight; policy.actor_shape().n_parameters()];
@@ -241,7 +241,7 @@ mod tests {
     fn a_policy_for_one_arm_acts_and_values_row_by_row() {
         let weight = 1.0 / 64.0;
         let mut teacher = OneArmPolicy::new(&policy(1, 1, weight)).unwrap();
-        assert_eq!(teacher.layout(), TaskSpec::built_in(Task::Push, 1));
+        assert_eq!(teacher.task(), TaskSpec::built_in(Task::Push, 1));
         assert_eq!(teacher.digest(), policy(1, 1, weight).digest());
 
         let (observations, goals) = ([[0.0; 28], [1.0; 28]].concat(), [0.0; 6]);

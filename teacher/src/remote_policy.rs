@@ -152,8 +152,8 @@ impl RemotePolicy {
 impl RemotePolicy {
     /// Returns the task, of one arm.
     #[must_use]
-    pub const fn layout(&self) -> &TaskSpec {
-        &self.description.layout
+    pub const fn task(&self) -> &TaskSpec {
+        &self.description.task
     }
 
     /// Returns the text that identifies the policy.
@@ -170,7 +170,7 @@ impl RemotePolicy {
 
     /// Fills in the answers of `batch`, and blocks until they arrive.
     pub(crate) fn evaluate(&mut self, batch: &mut Batch) -> Result<(), RemoteError> {
-        let layout = &self.description.layout;
+        let task = &self.description.task;
         let mut answers = PolicyAnswers {
             actions: Vec::with_capacity(2 * batch.student_actions.len()),
             values: Vec::with_capacity(2 * batch.n_rows),
@@ -181,9 +181,9 @@ impl RemotePolicy {
             let of = |length: usize| rows.start * length..rows.end * length;
             let request = encode_policy_request(
                 &self.description.digest,
-                &batch.observations[of(layout.n_observation())],
-                &batch.goals[of(layout.n_goal())],
-                &batch.student_actions[of(layout.n_action())],
+                &batch.observations[of(task.n_observation())],
+                &batch.goals[of(task.n_goal())],
+                &batch.student_actions[of(task.n_action())],
             );
             let mut part = self.call(request, rows.len())?;
             answers.actions.append(&mut part.actions);

@@ -54,7 +54,7 @@ impl EpisodeLog {
     /// the log is incomplete.
     #[must_use]
     pub fn succeeded(&self) -> Option<bool> {
-        let task = &self.metadata.layout;
+        let task = &self.metadata.task;
         self.ends_with(|observation, goal| task.is_success(observation, goal))
     }
 
@@ -62,13 +62,13 @@ impl EpisodeLog {
     /// log is incomplete.
     #[must_use]
     pub fn arm_succeeded(&self, arm: ArmIndex) -> Option<bool> {
-        let task = &self.metadata.layout;
+        let task = &self.metadata.task;
         self.ends_with(|observation, goal| task.arm_succeeds(arm, observation, goal))
     }
 
     fn ends_with(&self, succeeds: impl Fn(&[f32], &[f32]) -> bool) -> Option<bool> {
         let (last, goal) = (self.last_observation.as_ref()?, &self.transitions.last()?.goal);
-        let n_counted = self.metadata.layout.success_steps();
+        let n_counted = self.metadata.task.success_steps();
         let observations = self.transitions.iter().map(|step| &step.observation).chain([last]);
         let counted: Vec<_> = observations.rev().take(n_counted).collect();
         let is_long_enough = counted.len() == n_counted;
@@ -151,21 +151,21 @@ fn decode_episode(raw: RawLog) -> Result<EpisodeLog, String> {
     let metadata =
         raw.metadata.ok_or_else(|| format!("it has no metadata record {METADATA_NAME:?}"))?;
     let metadata = EpisodeMetadata::from_map(&metadata)?;
-    let layout = &metadata.layout;
+    let task = &metadata.task;
     let transitions = raw.transitions.iter().enumerate();
     let transitions = transitions
         .map(|(step_idx, bytes)| {
-            decode_transition(layout, step_idx, bytes)
+            decode_transition(task, step_idx, bytes)
                 .map_err(|problem| format!("step {step_idx}: {problem}"))
         })
         .collect::<Result<_, _>>()?;
     let last_observation =
-        raw.outcomes.last().map(|bytes| decode_last_observation(layout, bytes)).transpose()?;
+        raw.outcomes.last().map(|bytes| decode_last_observation(task, bytes)).transpose()?;
     Ok(EpisodeLog { metadata, transitions, last_observation })
 }
 
 fn decode_transition(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     step_idx: usize,
     bytes: &[u8],
 ) -> Result<LoggedTransition, String> {
@@ -177,11 +177,11 @@ fn decode_transition(
         u8::try_from(message.advised_arms).map_err(|error| format!("advised_arms: {error}"))?;
     let contacts = u8::try_from(message.contacts).ok().and_then(Contacts::from_bits);
     Ok(LoggedTransition {
-        observation: with_length("observation", message.observation, layout.n_observation())?,
-        goal: with_length("goal", message.goal, layout.n_goal())?,
-        action: with_length("action", message.action, layout.n_action())?,
+        observation: with_length("observation", message.observation, task.n_observation())?,
+        goal: with_length("goal", message.goal, task.n_goal())?,
+        action: with_length("action", message.action, task.n_action())?,
         reward: message.reward,
-        rewards_per_arm: with_length("rewards_per_arm", message.rewards_per_arm, layout.n_arms())?,
+        rewards_per_arm: with_length("rewards_per_arm", message.rewards_per_arm, task.n_arms())?,
         advised_arms,
         contacts: contacts.ok_or_else(|| format!("unknown contacts {:#b}", message.contacts))?,
         advice: message.advice.into_iter().map(ArmAdvice::from).collect(),
@@ -189,15 +189,15 @@ fn decode_transition(
     })
 }
 
-fn decode_last_observation(layout: &TaskSpec, bytes: &[u8]) -> Result<Vec<f32>, String> {
+fn decode_last_observation(task: &TaskSpec, bytes: &[u8]) -> Result<Vec<f32>, String> {
     let outcome: pb::Outcome = decode(bytes).map_err(|error| format!("outcome: {error}"))?;
-    with_length("last observation", outcome.observation, layout.n_observation())
+    with_length("last observation", outcome.observation, task.n_observation())
 }
 
 fn with_length(field: &str, numbers: Vec<f32>, expected: usize) -> Result<Vec<f32>, String> {
     match numbers.len() {
         got if got == expected => Ok(numbers),
-        got => Err(format!("{field} has {got} numbers, the layout has {expected}")),
+        got => Err(format!("{field} has {got} numbers, the task has {expected}")),
     }
 }
 

@@ -74,14 +74,14 @@ pub enum Error {
         /// Path of the log.
         path: PathBuf,
     },
-    /// A vector does not fit the layout of the episode or trial.
-    #[error("{field} has {got} numbers, the layout has {expected}")]
+    /// A vector does not fit the task of the episode or trial.
+    #[error("{field} has {got} numbers, the task has {expected}")]
     Length {
         /// Name of the vector.
         field: &'static str,
         /// Length of the vector.
         got: usize,
-        /// Length in the layout.
+        /// Length in that task.
         expected: usize,
     },
     /// A time is negative, not finite or too large for a log.

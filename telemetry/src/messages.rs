@@ -88,7 +88,7 @@ pub struct EpisodeMetadata {
     /// Version of the parameters that acted.
     pub parameter_version: u64,
     /// The task. The log of a task that is not built-in contains its description.
-    pub layout: TaskSpec,
+    pub task: TaskSpec,
     /// Digest of the policy that acted.
     pub policy_digest: String,
     /// Settings of the world by name.
@@ -109,8 +109,8 @@ const CHECKSUM: &str = "checksum";
 
 impl EpisodeMetadata {
     pub(crate) fn to_map(&self) -> BTreeMap<String, String> {
-        let is_described = self.layout.as_built_in().is_none();
-        let description = is_described.then(|| json!(self.layout.description()).to_string());
+        let is_described = self.task.as_built_in().is_none();
+        let description = is_described.then(|| json!(self.task.description()).to_string());
         let format = if is_described { DESCRIBED_FORMAT } else { FORMAT };
         let fields = [
             ("format", format.to_owned()),
@@ -119,8 +119,8 @@ impl EpisodeMetadata {
             ("seed", self.seed.to_string()),
             ("kind", kind_name(self.kind).to_owned()),
             ("parameter_version", self.parameter_version.to_string()),
-            ("task", self.layout.name().to_owned()),
-            ("arms", self.layout.n_arms().to_string()),
+            ("task", self.task.name().to_owned()),
+            ("arms", self.task.n_arms().to_string()),
             ("policy_digest", self.policy_digest.clone()),
         ];
         let world =
@@ -140,7 +140,7 @@ impl EpisodeMetadata {
         check_checksum(map)?;
         let (format, task, n_arms) = (text("format")?, text("task")?, number("arms")?);
         let n_arms = usize::try_from(n_arms).map_err(|error| format!("metadata arms: {error}"))?;
-        let layout = match format.as_str() {
+        let task = match format.as_str() {
             FORMAT => built_in_task(task, n_arms)?,
             DESCRIBED_FORMAT => described_task(task, n_arms, text(DESCRIPTION)?)?,
             _ => {
@@ -155,7 +155,7 @@ impl EpisodeMetadata {
             seed: number("seed")?,
             kind: kind_from_name(text("kind")?)?,
             parameter_version: number("parameter_version")?,
-            layout,
+            task,
             policy_digest: text("policy_digest")?.clone(),
             world: map
                 .iter()
@@ -255,7 +255,7 @@ mod tests {
             seed: 7,
             kind: EpisodeKind::Evaluation,
             parameter_version: 5,
-            layout: TaskSpec::new(description).unwrap(),
+            task: TaskSpec::new(description).unwrap(),
             policy_digest: "5f3a".to_owned(),
             world: BTreeMap::new(),
         }
@@ -263,7 +263,7 @@ mod tests {
 
     #[test]
     fn metadata_of_a_built_in_task_have_no_description() {
-        let metadata = EpisodeMetadata { layout: Layout::new(Task::Push, 2).into(), ..described() };
+        let metadata = EpisodeMetadata { task: Layout::new(Task::Push, 2).into(), ..described() };
         let map = metadata.to_map();
         let keys: Vec<&str> = map.keys().map(String::as_str).collect();
         let expected = [
@@ -309,7 +309,7 @@ mod tests {
         check("format", Some("3"), "this program reads \"1\" and \"2\"");
         let built_in = json!(Layout::new(Task::Push, 2).description()).to_string();
         check("description", Some(&built_in), "push is built-in");
-        let mut broken = described().layout.description().clone();
+        let mut broken = described().task.description().clone();
         broken.n_goal = 5;
         check("description", Some(&json!(broken).to_string()), "achieved_goal");
     }

@@ -55,12 +55,12 @@ struct Successes {
 }
 
 impl Successes {
-    fn count(&mut self, layout: &TaskSpec, observation: &[f32], goal: &[f32]) {
+    fn count(&mut self, task: &TaskSpec, observation: &[f32], goal: &[f32]) {
         let next = |n_steps: usize, succeeds: bool| if succeeds { n_steps + 1 } else { 0 };
-        for (n_steps, arm) in self.per_arm.iter_mut().zip(layout.arms()) {
-            *n_steps = next(*n_steps, layout.arm_succeeds(arm, observation, goal));
+        for (n_steps, arm) in self.per_arm.iter_mut().zip(task.arms()) {
+            *n_steps = next(*n_steps, task.arm_succeeds(arm, observation, goal));
         }
-        self.all = next(self.all, layout.is_success(observation, goal));
+        self.all = next(self.all, task.is_success(observation, goal));
     }
 }
 
@@ -73,7 +73,7 @@ impl Successes {
 /// The log of a task that is not built-in has no bodies to draw. Its scene has the achieved and the desired goals
 /// instead if these are points: parts of 2 or 3 numbers.
 pub struct EpisodeRecorder {
-    layout: TaskSpec,
+    task: TaskSpec,
     file: LogFile,
     channels: Channels,
     markers: Option<GoalMarkers>,
@@ -92,9 +92,9 @@ impl EpisodeRecorder {
     /// If the file cannot be written.
     pub fn create(path: &Path, metadata: &EpisodeMetadata) -> Result<Self, Error> {
         let mut file = LogFile::create(path)?;
-        let layout = metadata.layout.clone();
-        let markers = GoalMarkers::of(&layout).filter(|_| layout.as_built_in().is_none());
-        let has_scene = layout.as_built_in().is_some() || markers.is_some();
+        let task = metadata.task.clone();
+        let markers = GoalMarkers::of(&task).filter(|_| task.as_built_in().is_none());
+        let has_scene = task.as_built_in().is_some() || markers.is_some();
         let channels = Channels::start(&mut file, metadata, has_scene);
         let channels = channels.map_err(file.write_error())?;
         Ok(Self {
@@ -103,8 +103,8 @@ impl EpisodeRecorder {
             markers,
             goal: Vec::new(),
             stats: pb::Stats::default(),
-            successes: Successes { per_arm: vec![0; layout.n_arms()], all: 0 },
-            layout,
+            successes: Successes { per_arm: vec![0; task.n_arms()], all: 0 },
+            task,
             time_ns: 0,
             is_flushed: true,
         })
@@ -120,7 +120,7 @@ impl EpisodeRecorder {
     /// Logs one control step and the scene before it, if there is one.
     ///
     /// # Errors
-    /// If a vector does not fit the layout, or the file cannot be written.
+    /// If a vector does not fit the task, or the file cannot be written.
     pub fn record_step<'a>(
         &mut self,
         scene: impl Into<Option<&'a Scene>>,
@@ -131,7 +131,7 @@ impl EpisodeRecorder {
         self.set_time(scene, transition.step)?;
         transition.goal.clone_into(&mut self.goal);
         self.update_stats(scene, transition);
-        self.successes.count(&self.layout, transition.observation, &self.goal);
+        self.successes.count(&self.task, transition.observation, &self.goal);
         let caption = self.step_caption(transition);
         let state = State { scene, observation: transition.observation, caption };
         self.write_step(&state, transition).map_err(self.file.write_error())
@@ -141,18 +141,18 @@ impl EpisodeRecorder {
     /// outcome.
     ///
     /// # Errors
-    /// If the observation does not fit the layout, or the file cannot be written.
+    /// If the observation does not fit the task, or the file cannot be written.
     pub fn record_outcome<'a>(
         &mut self,
         scene: impl Into<Option<&'a Scene>>,
         observation: &[f32],
     ) -> Result<(), Error> {
-        check_length("observation", observation.len(), self.layout.n_observation())?;
+        check_length("observation", observation.len(), self.task.n_observation())?;
         let scene = scene.into();
         self.set_time(scene, self.stats.step + 1)?;
         self.set_distances(scene, observation);
         if !self.goal.is_empty() {
-            self.successes.count(&self.layout, observation, &self.goal);
+            self.successes.count(&self.task, observation, &self.goal);
         }
         let outcome = self.outcome(observation);
         let result = if outcome.success { "success" } else { "failure" };
@@ -180,12 +180,12 @@ impl EpisodeRecorder {
     }
 
     fn check_lengths(&self, transition: &TransitionRecord<'_>) -> Result<(), Error> {
-        check_length("observation", transition.observation.len(), self.layout.n_observation())?;
-        check_length("goal", transition.goal.len(), self.layout.n_goal())?;
-        check_length("action", transition.action.len(), self.layout.n_action())?;
-        check_length("rewards_per_arm", transition.rewards_per_arm.len(), self.layout.n_arms())?;
+        check_length("observation", transition.observation.len(), self.task.n_observation())?;
+        check_length("goal", transition.goal.len(), self.task.n_goal())?;
+        check_length("action", transition.action.len(), self.task.n_action())?;
+        check_length("rewards_per_arm", transition.rewards_per_arm.len(), self.task.n_arms())?;
         if !transition.advice.is_empty() {
-            check_length("advice", transition.advice.len(), self.layout.n_arms())?;
+            check_length("advice", transition.advice.len(), self.task.n_arms())?;
         }
         Ok(())
     }
@@ -199,7 +199,7 @@ impl EpisodeRecorder {
 
     fn update_stats(&mut self, scene: Option<&Scene>, transition: &TransitionRecord<'_>) {
         self.stats.step = transition.step;
-        self.stats.acting = acting(&self.layout, transition.advised_arms);
+        self.stats.acting = acting(&self.task, transition.advised_arms);
         self.stats.episode_return += f64::from(transition.reward);
         self.set_distances(scene, transition.observation);
         self.stats.advised_steps += u32::from(transition.advised_arms != 0);
@@ -211,15 +211,15 @@ impl EpisodeRecorder {
         if self.goal.is_empty() {
             return;
         }
-        self.stats.goal_distance = self.layout.goal_distances(observation, &self.goal);
+        self.stats.goal_distance = self.task.goal_distances(observation, &self.goal);
         self.stats.goal_distance_m = scene.map(goal_distances_m).unwrap_or_default();
     }
 
     /// Returns for each arm whether it succeeds now; there is no goal before the first step.
     fn success_per_arm(&self, observation: &[f32]) -> Vec<bool> {
         let at_goal =
-            |arm| !self.goal.is_empty() && self.layout.arm_succeeds(arm, observation, &self.goal);
-        self.layout.arms().map(at_goal).collect()
+            |arm| !self.goal.is_empty() && self.task.arm_succeeds(arm, observation, &self.goal);
+        self.task.arms().map(at_goal).collect()
     }
 
     fn step_caption(&self, step: &TransitionRecord<'_>) -> String {
@@ -232,7 +232,7 @@ impl EpisodeRecorder {
             at_goal.len(),
             self.stats.advised_steps,
         );
-        if self.layout.reports_contacts() {
+        if self.task.reports_contacts() {
             caption.push_str(&format!("   contact steps {}", self.stats.contact_steps));
         }
         caption
@@ -240,7 +240,7 @@ impl EpisodeRecorder {
 
     /// Returns the outcome as an evaluation counts it.
     fn outcome(&self, observation: &[f32]) -> pb::Outcome {
-        let lasts = |n_steps: &usize| *n_steps >= self.layout.success_steps();
+        let lasts = |n_steps: &usize| *n_steps >= self.task.success_steps();
         pb::Outcome {
             observation: observation.to_vec(),
             success: lasts(&self.successes.all),
@@ -255,7 +255,7 @@ impl EpisodeRecorder {
         step: &TransitionRecord<'_>,
     ) -> mcap::McapResult<()> {
         self.write_scene(state)?;
-        let message = transition_message(&self.layout, step);
+        let message = transition_message(&self.task, step);
         self.channels.transition.write(&mut self.file, self.time_ns, &message)?;
         self.channels.stats.write(&mut self.file, self.time_ns, &self.stats)?;
         if self.is_flushed && (step.step + 1).is_multiple_of(FLUSH_EVERY_STEPS) {
@@ -323,7 +323,7 @@ impl Channels {
     ) -> mcap::McapResult<Self> {
         file.write_metadata(METADATA_NAME, metadata.to_map())?;
         let scene = if has_scene { Some(Channel::open(file, "/scene")?) } else { None };
-        let bodies = match metadata.layout.as_built_in() {
+        let bodies = match metadata.task.as_built_in() {
             Some(_) => Some(BodyChannels {
                 tf: Channel::open(file, "/tf")?,
                 joint_states: Channel::open(file, "/joint_states")?,

@@ -87,7 +87,7 @@ fn an_episode_of_a_described_task_is_read_back_with_its_description() {
     let dir = tempfile::tempdir().unwrap();
     let record = |n_goal_per_arm: usize| {
         let task = synthetic::described(n_goal_per_arm);
-        let metadata = EpisodeMetadata { layout: task.clone(), ..synthetic::metadata() };
+        let metadata = EpisodeMetadata { task: task.clone(), ..synthetic::metadata() };
         let path = dir.path().join(format!("{n_goal_per_arm}.mcap"));
         let path = synthetic::write_described_log(&path, &task).unwrap();
         let (log, steps) = (read_episode(&path).unwrap(), synthetic::transitions_of(&task));
@@ -133,7 +133,7 @@ fn outcome(n_at_goal: [usize; 2]) -> (bool, Vec<bool>) {
         observation
     };
     let dir = tempfile::tempdir().unwrap();
-    let metadata = EpisodeMetadata { layout: task.clone(), ..synthetic::metadata() };
+    let metadata = EpisodeMetadata { task: task.clone(), ..synthetic::metadata() };
     let mut recorder =
         EpisodeRecorder::create(&dir.path().join("outcome.mcap"), &metadata).unwrap();
     for (step, mut transition) in (0..).zip(synthetic::transitions_of(&task)) {
@@ -308,7 +308,7 @@ fn a_file_without_messages_is_not_recovered_as_an_empty_file() {
 }
 
 #[test]
-fn vectors_that_do_not_fit_the_layout_are_refused() {
+fn vectors_that_do_not_fit_the_task_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let mut recorder =
         EpisodeRecorder::create(&dir.path().join("e.mcap"), &synthetic::metadata()).unwrap();

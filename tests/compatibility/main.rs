@@ -54,12 +54,12 @@ fn policies_are_read() {
         for (task, n_arms) in POLICIES {
             let path = version.join(format!("policies/{task}-{n_arms}.safetensors"));
             let policy = Policy::load(&path).expect("a policy");
-            assert_eq!(policy.layout, Layout::new(task, n_arms).into(), "{path:?}");
+            assert_eq!(policy.task, Layout::new(task, n_arms).into(), "{path:?}");
             assert_eq!((policy.n_hidden, policy.n_hidden_layers), (8, 1), "{path:?}");
-            let mut action = vec![f32::NAN; policy.layout.n_action()];
-            let observation = vec![0.1; policy.layout.n_observation()];
+            let mut action = vec![f32::NAN; policy.task.n_action()];
+            let observation = vec![0.1; policy.task.n_observation()];
             let mut actor = policy.actor().expect("usable");
-            actor.act(&observation, &vec![0.2; policy.layout.n_goal()], &mut action);
+            actor.act(&observation, &vec![0.2; policy.task.n_goal()], &mut action);
             let expected = actions[format!("{task}-{n_arms}")].clone();
             let expected: Vec<f64> = serde_json::from_value(expected).expect("numbers");
             assert_eq!(action.len(), expected.len(), "{path:?}");
@@ -101,7 +101,7 @@ fn an_episode_log_is_read() {
     for version in versions() {
         let expected = &expected(&version)["episode"];
         let log = read_episode(&version.join("episode.mcap")).expect("an episode");
-        assert_eq!(log.metadata.layout, Layout::new(Task::Push, 2).into());
+        assert_eq!(log.metadata.task, Layout::new(Task::Push, 2).into());
         assert_eq!(log.metadata.parameter_version, expected["parameter_version"]);
         assert_eq!(log.metadata.world["substeps"], expected["substeps"]);
         assert_eq!(log.transitions.len(), expected["n_transitions"]);

@@ -72,7 +72,7 @@ fn episodes_of_every_kind_replay_bit_for_bit() {
 
 /// Writes the content of `log` to a new file with valid checksums, without scenes if the task is not built-in.
 fn rewrite(log: &EpisodeLog, metadata: &EpisodeMetadata, path: &Path) {
-    let has_scenes = metadata.layout.as_built_in().is_some();
+    let has_scenes = metadata.task.as_built_in().is_some();
     let mut world = world_of(&log.metadata).expect("described");
     let mut recorder = EpisodeRecorder::create(path, metadata).expect("created");
     for (step, transition) in (0..).zip(&log.transitions) {
@@ -177,9 +177,9 @@ fn a_log_of_a_described_task_is_printed_but_needs_its_environments_to_be_compare
         name: "lab/pick".to_owned(),
         ..Layout::new(Task::PickAndPlace, 2).description()
     };
-    let layout = TaskSpec::new(description).expect("valid");
+    let task = TaskSpec::new(description).expect("valid");
     let described = keep.path().join("described.mcap");
-    rewrite(&log, &EpisodeMetadata { layout, ..log.metadata.clone() }, &described);
+    rewrite(&log, &EpisodeMetadata { task, ..log.metadata.clone() }, &described);
 
     let printed = tandem(&["replay"], &[&described]);
     assert!(printed.status.success() && printed.stderr.is_empty(), "{printed:?}");

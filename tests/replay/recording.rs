@@ -80,7 +80,7 @@ pub(crate) fn terms(layout: Layout, kind: Kind, substeps: u32) -> RunTerms {
     RunTerms {
         symmetrized_evaluation: false,
         run: "replay".to_owned(),
-        layout: layout.into(),
+        task: layout.into(),
         account: Some("replay".to_owned()),
         advice: AdviceTerms::default(),
         exploration: Exploration {

@@ -211,7 +211,7 @@ fn query(episode: u64, step: u32) -> pb::StepQuery {
 struct StillTeacher;
 
 impl TeacherPolicy for StillTeacher {
-    fn layout(&self) -> tandem_core::TaskSpec {
+    fn task(&self) -> tandem_core::TaskSpec {
         STILL.into()
     }
 

@@ -80,11 +80,11 @@ fn replay(
     terms: &RunTerms,
     episodes: &[Episode],
 ) -> Result<Option<Difference>, EnvironmentError> {
-    let layout = &terms.layout;
-    let mut observations = vec![0.0; episodes.len() * layout.n_observation()];
-    let mut goals = vec![0.0; episodes.len() * layout.n_goal()];
+    let task = &terms.task;
+    let mut observations = vec![0.0; episodes.len() * task.n_observation()];
+    let mut goals = vec![0.0; episodes.len() * task.n_goal()];
     env.reset(&episode_starts(order, terms), &mut observations, &mut goals)?;
-    for (episode, goal) in episodes.iter().zip(goals.chunks_exact(layout.n_goal())) {
+    for (episode, goal) in episodes.iter().zip(goals.chunks_exact(task.n_goal())) {
         let difference = first_difference((episode, 0, "goal"), &episode.goal, goal);
         if difference.is_some() {
             return Ok(difference);
@@ -93,7 +93,7 @@ fn replay(
     let mut contacts = vec![Contacts::NONE; episodes.len()];
     let n_steps = episodes.iter().map(|episode| episode.contacts.len()).min().unwrap_or_default();
     for step in 0..=n_steps {
-        let difference = observed_difference(layout, episodes, step, &observations);
+        let difference = observed_difference(task, episodes, step, &observations);
         if difference.is_some() || step == n_steps {
             return Ok(difference);
         }
@@ -113,12 +113,12 @@ fn replay(
 
 /// Compares the observations of all episodes after `step` steps, shape `[n, n_observation]`.
 fn observed_difference(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     episodes: &[Episode],
     step: usize,
     observations: &[f32],
 ) -> Option<Difference> {
-    let rows = episodes.iter().zip(observations.chunks_exact(layout.n_observation()));
+    let rows = episodes.iter().zip(observations.chunks_exact(task.n_observation()));
     rows.filter_map(|(episode, second)| {
         first_difference((episode, step, "observation"), episode.observation(step), second)
     })

@@ -127,7 +127,7 @@ pub enum Error {
     /// The run's simulator cannot be built.
     #[error("the run's world cannot be built")]
     World(#[from] SimError),
-    /// The published parameters do not fit the run's layout.
+    /// The published parameters do not fit the run's task.
     #[error("parameters of version {version} cannot be used")]
     Parameters {
         /// The version of the parameters.

@@ -138,10 +138,10 @@ fn slot_of(numbers: impl IntoIterator<Item = u64>, seed: u64) -> SlotOrder {
 }
 
 /// Returns terms for evaluations, which use only the task: the world is built already.
-fn evaluation_terms(layout: impl Into<TaskSpec>) -> RunTerms {
+fn evaluation_terms(task: impl Into<TaskSpec>) -> RunTerms {
     RunTerms {
         run: String::new(),
-        layout: layout.into(),
+        task: task.into(),
         account: None,
         advice: AdviceTerms::default(),
         exploration: Exploration::NONE,

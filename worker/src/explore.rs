@@ -15,7 +15,7 @@ use tandem_core::{ArmIndex, Exploration, TaskSpec};
 /// changes the draws of later steps.
 #[derive(Debug, Clone)]
 pub struct Explorer {
-    layout: TaskSpec,
+    task: TaskSpec,
     noise_std: f32,
     hold_mean_steps: f32,
     start_probability: f32,
@@ -34,9 +34,9 @@ struct HeldAction {
 impl Explorer {
     /// Creates an explorer with these settings that draws from `rng`.
     #[must_use]
-    pub fn new(layout: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
-        let layout = layout.into();
-        let n_per_arm = layout.action_of(ArmIndex(0)).len();
+    pub fn new(task: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
+        let task = task.into();
+        let n_per_arm = task.action_of(ArmIndex(0)).len();
         let idle = HeldAction { n_steps_left: 0, action: vec![0.0; n_per_arm] };
         Self {
             noise_std: settings.noise_std,
@@ -46,16 +46,16 @@ impl Explorer {
                 settings.sticky_random_mean_steps,
             ),
             joint_random_actions: settings.joint_random_actions,
-            held: vec![idle; layout.n_arms()],
-            layout,
+            held: vec![idle; task.n_arms()],
+            task,
             rng,
         }
     }
 
     /// Creates an explorer for a warm-up: every arm takes a random action on every step.
     #[must_use]
-    pub fn uniform(layout: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
-        Self::new(layout, Exploration { random_action_prob: 1.0, ..settings }, rng)
+    pub fn uniform(task: impl Into<TaskSpec>, settings: Exploration, rng: ChaCha8Rng) -> Self {
+        Self::new(task, Exploration { random_action_prob: 1.0, ..settings }, rng)
     }
 
     /// Turns the policy's action for the next step into the action to execute, shape `[n_action]`, in [-1, 1].
@@ -73,14 +73,14 @@ impl Explorer {
     /// If the action is too short.
     pub fn explore_holding(&mut self, action: &mut [f32], holds: impl Fn(ArmIndex) -> bool) {
         let mut joint = None;
-        for arm in self.layout.arms() {
+        for arm in self.task.arms() {
             let own = HoldDraw::new(&mut self.rng, self.start_probability, self.hold_mean_steps);
             let draw = *joint.get_or_insert(own);
             let draw = if self.joint_random_actions { draw } else { own };
             self.held[arm.0].advance(draw, &mut self.rng);
-            let (part, held) = (self.layout.action_of(arm), &self.held[arm.0]);
+            let (part, held) = (self.task.action_of(arm), &self.held[arm.0]);
             explore_arm(part, held, self.noise_std, &mut self.rng, action);
-            let gripper = self.layout.gripper_of(arm).filter(|_| held.n_steps_left > 0);
+            let gripper = self.task.gripper_of(arm).filter(|_| held.n_steps_left > 0);
             if let Some(gripper) = gripper
                 && holds(arm)
             {

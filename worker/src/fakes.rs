@@ -159,7 +159,7 @@ impl<F: Fn(u64, u32, usize) -> bool> Advisor for FakeTeacher<F> {
 pub(crate) fn terms() -> RunTerms {
     RunTerms {
         run: "run-7".to_owned(),
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         account: Some("run".to_owned()),
         advice: AdviceTerms::default(),
         exploration: Exploration {

@@ -74,18 +74,18 @@ impl LearnerClient {
         decode_work(response).map(Some).map_err(|error| Error::protocol(NEXT_WORK, error))
     }
 
-    /// Returns the actor of `version` for `layout`, unless the learner no longer has that version.
+    /// Returns the actor of `version` for `task`, unless the learner no longer has that version.
     pub(crate) async fn parameters(
         &self,
         version: u64,
-        layout: &TaskSpec,
+        task: &TaskSpec,
     ) -> Result<Option<PublishedActor>, Error> {
         let request = pb::GetParametersRequest { version };
         let call = |mut client: Rpc, request| async move { client.get_parameters(request).await };
         let response = self.call(FETCH, self.timeouts.call, request, call).await;
         let Some(response) = if_known(FETCH, response)? else { return Ok(None) };
         let decode = || {
-            let published = tandem_proto::decode_actor(&response, layout)?;
+            let published = tandem_proto::decode_actor(&response, task)?;
             expect_same("parameters of version", version, published.version)?;
             Ok::<_, CallError>(published)
         };

@@ -58,8 +58,8 @@ impl Player {
         recorder: Option<Recorder>,
         metrics: WorkerMetrics,
     ) -> Result<Self, Error> {
-        let Some(layout) = terms.layout.as_built_in() else {
-            return Err(Error::NotBuiltIn { task: terms.layout.name().to_owned() });
+        let Some(layout) = terms.task.as_built_in() else {
+            return Err(Error::NotBuiltIn { task: terms.task.name().to_owned() });
         };
         let world = Env::new(layout, &WorldConfig::from(terms.world))?;
         let simulator = Some(Simulator::new(world));
@@ -104,14 +104,14 @@ impl Player {
         published: PublishedActor,
         kind: EpisodeKind,
     ) -> Result<(), tandem_policy::Error> {
-        let layout = &self.terms.layout;
+        let task = &self.terms.task;
         self.is_symmetrized = self.symmetrizes(kind);
         let published =
-            if self.is_symmetrized { symmetrized_actor(layout, &published) } else { published };
+            if self.is_symmetrized { symmetrized_actor(task, &published) } else { published };
         let for_digest = self.recorder.is_some().then(|| published.clone());
-        self.actor = Some(Actor::new(layout, published)?);
+        self.actor = Some(Actor::new(task, published)?);
         self.actor_digest =
-            for_digest.map_or_else(String::new, |published| actor_digest(layout, &published));
+            for_digest.map_or_else(String::new, |published| actor_digest(task, &published));
         Ok(())
     }
 

@@ -100,7 +100,7 @@ pub fn metadata_of(
         seed: order.seed,
         kind: episode.kind,
         parameter_version: episode.parameter_version,
-        layout: episode.layout.clone(),
+        task: episode.task.clone(),
         policy_digest,
         world: world_settings(&order, episode.kind, terms)
             .log_entries()
@@ -133,8 +133,8 @@ pub fn start_of(metadata: &EpisodeMetadata) -> Result<EpisodeStart, RecordError>
 /// When the task is not built-in, the metadata lack an entry or have one that is out of its range, only earlier
 /// versions have such starts, or the world cannot be built.
 pub fn world_of(metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
-    let no_simulator = || RecordError::NoSimulator { task: metadata.layout.name().to_owned() };
-    world_in(metadata.layout.as_built_in().ok_or_else(no_simulator)?, metadata)
+    let no_simulator = || RecordError::NoSimulator { task: metadata.task.name().to_owned() };
+    world_in(metadata.task.as_built_in().ok_or_else(no_simulator)?, metadata)
 }
 
 fn world_in(layout: Layout, metadata: &EpisodeMetadata) -> Result<Env, RecordError> {
@@ -169,7 +169,7 @@ pub fn record_episode(
     episode: &Episode,
     path: &Path,
 ) -> Result<PathBuf, RecordError> {
-    let mut world = match metadata.layout.as_built_in() {
+    let mut world = match metadata.task.as_built_in() {
         Some(layout) => Some(world_in(layout, metadata)?),
         None => None,
     };
@@ -220,7 +220,7 @@ fn record_step(
     advice: Option<&TracedAdvice>,
 ) -> Result<(), RecordError> {
     let after = episode.observation(step_idx + 1);
-    let rewards_per_arm = rewards_per_arm(&episode.layout, after, &episode.goal);
+    let rewards_per_arm = rewards_per_arm(&episode.task, after, &episode.goal);
     let transition = TransitionRecord {
         step: u32::try_from(step_idx).expect("an episode's steps are few"),
         observation: episode.observation(step_idx),
@@ -301,7 +301,7 @@ mod tests {
                 log.transitions.iter().flat_map(|step| step.action.clone()).collect();
             assert_eq!(actions, episode.actions);
             assert_eq!(log.last_observation.as_deref(), Some(episode.last_observation()));
-            let mut start = vec![0.0; episode.layout.n_observation()];
+            let mut start = vec![0.0; episode.task.n_observation()];
             world_of(&log.metadata).expect("described").observe(&mut start);
             assert_eq!(start, episode.observation(0));
         }
@@ -310,7 +310,7 @@ mod tests {
     #[test]
     fn an_episode_whose_replay_differs_gets_no_log() {
         let (metadata, mut episode) = played(EpisodeKind::Evaluation);
-        let n_observation = episode.layout.n_observation();
+        let n_observation = episode.task.n_observation();
         episode.observations[7 * n_observation] += 1e-3;
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("eval.mcap");

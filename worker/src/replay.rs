@@ -78,7 +78,7 @@ impl<'a> Comparison<'a> {
         if log.transitions.is_empty() {
             return Err(RecordError::NoSteps);
         }
-        Ok(Self { log, task: &log.metadata.layout })
+        Ok(Self { log, task: &log.metadata.task })
     }
 
     async fn play_on(self, environments: &mut EnvironmentClient) -> Result<(), PlayError> {

@@ -35,7 +35,7 @@ pub enum RolloutError {
         /// The cause.
         source: SimError,
     },
-    /// The teacher's response is about other steps or another layout than the request.
+    /// The teacher's response is about other steps or another task than the request.
     #[error(
         "the teacher's advice on episode {episode}, step {step}, has {got} {field} where {expected} were expected"
     )]
@@ -106,8 +106,8 @@ pub fn play_traced_slot(
     if tracing == Tracing::On {
         rollouts.iter_mut().for_each(|rollout| rollout.trace = Some(Trace::default()));
     }
-    let mut batch = StepBatch::new(order.episodes.len(), &terms.layout);
-    for step_idx in 0..terms.layout.episode_steps() {
+    let mut batch = StepBatch::new(order.episodes.len(), &terms.task);
+    for step_idx in 0..terms.task.episode_steps() {
         trace_scenes(&mut rollouts, env);
         for rollout in &mut rollouts {
             rollout.choose_action(actor, step_idx);
@@ -149,7 +149,7 @@ pub(crate) fn world_settings(
     kind: EpisodeKind,
     terms: &RunTerms,
 ) -> WorldSettings {
-    let n_steps = terms.layout.episode_steps() as u64;
+    let n_steps = terms.task.episode_steps() as u64;
     terms.world.at(kind, episode.number.saturating_mul(n_steps))
 }
 
@@ -159,19 +159,19 @@ fn start(
     order: &SlotOrder,
     terms: &RunTerms,
 ) -> Result<Vec<Rollout>, RolloutError> {
-    let (n, layout) = (order.episodes.len(), &terms.layout);
-    let mut observations = vec![0.0; n * layout.n_observation()];
-    let mut goals = vec![0.0; n * layout.n_goal()];
+    let (n, task) = (order.episodes.len(), &terms.task);
+    let mut observations = vec![0.0; n * task.n_observation()];
+    let mut goals = vec![0.0; n * task.n_goal()];
     env.reset(&episode_starts(order, terms), &mut observations, &mut goals)?;
-    let observations = observations.chunks_exact(layout.n_observation());
-    let rows = observations.zip(goals.chunks_exact(layout.n_goal()));
+    let observations = observations.chunks_exact(task.n_observation());
+    let rows = observations.zip(goals.chunks_exact(task.n_goal()));
     let start = |(episode, row): (&EpisodeOrder, _)| Rollout::start(*episode, order, terms, row);
     Ok(order.episodes.iter().zip(rows).map(start).collect())
 }
 
 /// The vectors of one step of all environments, for reuse.
 struct StepBatch {
-    layout: TaskSpec,
+    task: TaskSpec,
     /// Shape `[n, n_action]`.
     actions: Vec<f32>,
     /// Shape `[n, n_observation]`.
@@ -181,11 +181,11 @@ struct StepBatch {
 }
 
 impl StepBatch {
-    fn new(n: usize, layout: &TaskSpec) -> Self {
+    fn new(n: usize, task: &TaskSpec) -> Self {
         Self {
-            layout: layout.clone(),
-            actions: vec![0.0; n * layout.n_action()],
-            observations: vec![0.0; n * layout.n_observation()],
+            task: task.clone(),
+            actions: vec![0.0; n * task.n_action()],
+            observations: vec![0.0; n * task.n_observation()],
             contacts: vec![Contacts::NONE; n],
         }
     }
@@ -197,13 +197,13 @@ impl StepBatch {
         step_idx: usize,
         env: &mut impl VectorEnv,
     ) -> Result<(), RolloutError> {
-        let Self { layout, actions, observations, contacts } = self;
-        for (rollout, action) in rollouts.iter().zip(actions.chunks_exact_mut(layout.n_action())) {
+        let Self { task, actions, observations, contacts } = self;
+        for (rollout, action) in rollouts.iter().zip(actions.chunks_exact_mut(task.n_action())) {
             action.copy_from_slice(&rollout.action);
         }
         let stepped = env.step(actions, observations, contacts);
         stepped.map_err(|error| failed_step(error, rollouts, step_idx))?;
-        let results = observations.chunks_exact(layout.n_observation()).zip(contacts);
+        let results = observations.chunks_exact(task.n_observation()).zip(contacts);
         for (rollout, (observation, contacts)) in rollouts.iter_mut().zip(results) {
             rollout.record(observation, *contacts);
         }
@@ -337,17 +337,17 @@ impl Rollout {
         terms: &RunTerms,
         (observation, goal): (&[f32], &[f32]),
     ) -> Self {
-        let (layout, n_steps) = (&terms.layout, terms.layout.episode_steps());
-        let mut observations = Vec::with_capacity((n_steps + 1) * layout.n_observation());
+        let (task, n_steps) = (&terms.task, terms.task.episode_steps());
+        let mut observations = Vec::with_capacity((n_steps + 1) * task.n_observation());
         observations.extend_from_slice(observation);
         let episode = Episode {
             number: order.number,
             kind: slot.kind,
             parameter_version: slot.parameter_version,
-            layout: layout.clone(),
+            task: task.clone(),
             observations,
             goal: goal.to_vec(),
-            actions: Vec::with_capacity(n_steps * layout.n_action()),
+            actions: Vec::with_capacity(n_steps * task.n_action()),
             advised_arms: Vec::with_capacity(n_steps),
             contacts: Vec::with_capacity(n_steps),
             advice_charged: 0,
@@ -359,10 +359,10 @@ impl Rollout {
             order,
             asks: false,
             observation: observation.to_vec(),
-            action: vec![0.0; layout.n_action()],
+            action: vec![0.0; task.n_action()],
             policy_action: match terms.advice.judged_action {
                 JudgedAction::Executed => None,
-                JudgedAction::Policy => Some(vec![0.0; layout.n_action()]),
+                JudgedAction::Policy => Some(vec![0.0; task.n_action()]),
             },
             advised_arms: 0,
             episode,
@@ -381,34 +381,34 @@ impl Rollout {
             policy_action.copy_from_slice(&self.action);
         }
         if let Some(explorer) = &mut self.explorer {
-            let (layout, observation) = (&self.episode.layout, &self.observation);
-            explorer.explore_holding(&mut self.action, |arm| layout.arm_holds(arm, observation));
+            let (task, observation) = (&self.episode.task, &self.observation);
+            explorer.explore_holding(&mut self.action, |arm| task.arm_holds(arm, observation));
         }
     }
 
     /// Returns the query on the next step, in arm order.
     fn query(&self, step_idx: usize) -> StepQuery {
-        let layout = &self.episode.layout;
+        let task = &self.episode.task;
         StepQuery {
             episode: self.episode.number,
             step: u32::try_from(step_idx).expect("an episode's steps are few"),
-            observation: layout.observation_in_arm_order(&self.observation),
-            goal: layout.goal_in_arm_order(&self.episode.goal),
-            proposed_action: layout.action_in_arm_order(&self.action),
+            observation: task.observation_in_arm_order(&self.observation),
+            goal: task.goal_in_arm_order(&self.episode.goal),
+            proposed_action: task.action_in_arm_order(&self.action),
             judged_action: self
                 .policy_action
                 .as_ref()
-                .map(|action| layout.action_in_arm_order(action)),
+                .map(|action| task.action_in_arm_order(action)),
             payer: None,
         }
     }
 
     /// Replaces the proposed action by the teacher's advice.
     fn apply_advice(&mut self, advice: &StepAdvice, step_idx: usize) -> Result<(), RolloutError> {
-        let (number, layout) = (self.episode.number, &self.episode.layout);
-        check_count(number, step_idx, "action components", advice.action.len(), layout.n_action())?;
-        check_count(number, step_idx, "arms", advice.arms.len(), layout.n_arms())?;
-        layout.write_action_in_arm_order(&advice.action, &mut self.action);
+        let (number, task) = (self.episode.number, &self.episode.task);
+        check_count(number, step_idx, "action components", advice.action.len(), task.n_action())?;
+        check_count(number, step_idx, "arms", advice.arms.len(), task.n_arms())?;
+        task.write_action_in_arm_order(&advice.action, &mut self.action);
         self.advised_arms = advice.overridden_arms();
         if self.advised_arms != 0 && !advice.charged {
             return Err(RolloutError::UnchargedAdvice { episode: number, step: step_idx });
@@ -440,7 +440,7 @@ fn explorer(order: EpisodeOrder, kind: EpisodeKind, terms: &RunTerms) -> Option<
         EpisodeExploration::Uniform => Explorer::uniform,
         EpisodeExploration::Greedy => return None,
     };
-    Some(explorer(&terms.layout, terms.exploration, rng))
+    Some(explorer(&terms.task, terms.exploration, rng))
 }
 
 #[cfg(test)]

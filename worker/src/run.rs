@@ -166,15 +166,15 @@ impl Worker {
         }
         tracing::info!(
             worker_id,
-            task = terms.layout.name(),
-            n_arms = terms.layout.n_arms(),
+            task = terms.task.name(),
+            n_arms = terms.task.n_arms(),
             "run joined"
         );
         let (recorder, metrics) = (self.recorder.clone(), self.metrics.clone());
         let player = match &mut self.environments {
             None => Player::simulating(terms, recorder, metrics)?,
             Some(environments) => {
-                environments.check(&terms.layout).await?;
+                environments.check(&terms.task).await?;
                 Player::remote(terms, recorder, metrics)
             }
         };
@@ -225,8 +225,7 @@ impl Worker {
             return Ok(true);
         }
         let version = order.parameter_version;
-        let Some(published) = self.learner.parameters(version, &player.terms().layout).await?
-        else {
+        let Some(published) = self.learner.parameters(version, &player.terms().task).await? else {
             return Ok(false);
         };
         player
@@ -274,7 +273,7 @@ impl Worker {
         trace: TraceContext,
     ) -> Result<(Box<Player>, Result<PlayedSlot, SlotFailure>), Error> {
         let slot = order.slot;
-        let (account, task) = (player.terms().account.clone(), player.terms().layout.clone());
+        let (account, task) = (player.terms().account.clone(), player.terms().task.clone());
         let (peers, mut requests) = PeerChannel::new();
         let (finished, playing) = oneshot::channel();
         let tracked = self.rollouts.token();

@@ -39,7 +39,7 @@ impl TeacherClient {
     pub(crate) async fn advise(
         &mut self,
         account: &str,
-        layout: &TaskSpec,
+        task: &TaskSpec,
         queries: &[StepQuery],
         trace: TraceContext,
     ) -> Result<AdviceReply, Error> {
@@ -53,7 +53,7 @@ impl TeacherClient {
         let response = response.map_err(|status| Error::protocol(ADVISE, status))?;
         let decode = || {
             expect_same("steps", queries.len() as u64, response.steps.len() as u64)?;
-            let decode = |advice| tandem_proto::decode_advice(advice, layout);
+            let decode = |advice| tandem_proto::decode_advice(advice, task);
             let steps = response.steps.into_iter().map(decode).collect::<Result<_, _>>()?;
             Ok::<_, CallError>(AdviceReply { steps, budget_left: response.budget_left })
         };

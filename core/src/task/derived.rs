@@ -83,7 +83,7 @@ impl TaskSpec {
     }
 
     /// Returns the task of `n_arms` arms whose vectors are the concatenated vectors of this task's arms: the form in
-    /// which a student of any layout asks a teacher for one arm.
+    /// which a student with any number of arms asks a teacher for one arm.
     ///
     /// # Errors
     /// When numbers belong to no arm; otherwise names the limit that the result exceeds.

@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_is_copied_between_layouts() {
+    fn a_part_is_copied_between_vectors() {
         let source = [10.0, 11.0, 12.0, 13.0];
         for (to, from, expected) in [
             (vec![0, 1], vec![2, 3], [12.0, 13.0, 0.0]),

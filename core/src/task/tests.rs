@@ -65,7 +65,7 @@ fn carried() -> TaskDescription {
 }
 
 #[test]
-fn a_built_in_task_has_the_layout_of_its_vectors() {
+fn a_built_in_task_has_the_parts_of_its_layout() {
     for (task, n_arms) in [(Task::Push, 1), (Task::PickAndPlace, 2), (Task::Push, 8)] {
         let layout = Layout::new(task, n_arms);
         let spec = TaskSpec::new(layout.description()).unwrap();

@@ -27,5 +27,5 @@ fn main() -> Result<(), Error> {
 /// Returns the name of the policy's task and the policy's digest.
 fn entry(path: &Path) -> Result<(String, Value), Error> {
     let policy = Policy::from_bytes(&std::fs::read(path)?)?;
-    Ok((policy.layout.name().to_owned(), Value::String(digest(&policy)?)))
+    Ok((policy.task.name().to_owned(), Value::String(digest(&policy)?)))
 }

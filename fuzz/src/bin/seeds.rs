@@ -152,7 +152,7 @@ fn write_messages(to: &Path) -> Result<(), AnyError> {
     let terms = RunTerms {
         symmetrized_evaluation: true,
         run: "run-7".to_owned(),
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         account: Some("run-7".to_owned()),
         advice: AdviceTerms::default(),
         exploration: Exploration {

@@ -192,8 +192,8 @@ impl Reader<'_> {
             RoundStats { critic_loss, actor_loss, mean_q, training_success, training_moved };
         self.restore_networks(trainer)?;
         trainer.observation_normalizer =
-            self.normalizer("observation", trainer.layout.n_observation())?;
-        trainer.goal_normalizer = self.normalizer("goal", trainer.layout.n_goal())?;
+            self.normalizer("observation", trainer.task.n_observation())?;
+        trainer.goal_normalizer = self.normalizer("goal", trainer.task.n_goal())?;
         self.restore_replay(trainer)?;
         let history = EvaluationHistory {
             rows: self.rows()?,
@@ -269,7 +269,7 @@ impl Reader<'_> {
         };
         let next = usize::try_from(self.count("replay.next")?).unwrap_or(usize::MAX);
         let capacity = trainer.config.replay.capacity_transitions;
-        trainer.replay = ReplayBuffer::from_parts(&trainer.layout, capacity, parts, next)
+        trainer.replay = ReplayBuffer::from_parts(&trainer.task, capacity, parts, next)
             .ok_or("its replay buffer is invalid or does not fit replay.capacity_transitions in the run file")?;
         Ok(())
     }
@@ -300,7 +300,7 @@ impl Reader<'_> {
             },
         };
         // Workers would refuse an unusable actor later; here the error names the checkpoint.
-        match tandem_policy::Actor::new(&trainer.layout, acting.clone()) {
+        match tandem_policy::Actor::new(&trainer.task, acting.clone()) {
             Ok(_) => Ok(acting),
             Err(error) => Err(format!("its acting parameters cannot be used: {error}")),
         }

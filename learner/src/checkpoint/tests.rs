@@ -13,11 +13,11 @@ use tempfile::TempDir;
 use super::*;
 
 /// Returns an episode in which the object of arm 0 moves by `drift_m` per step along x.
-fn drifting_episode(layout: &TaskSpec, number: u64, drift_m: f32) -> Episode {
-    let mut episode = Episode::zeros(layout, number);
-    let x = layout.achieved_goal_of(ArmIndex(0)).index(0);
+fn drifting_episode(task: &TaskSpec, number: u64, drift_m: f32) -> Episode {
+    let mut episode = Episode::zeros(task, number);
+    let x = task.achieved_goal_of(ArmIndex(0)).index(0);
     let mut position = 0.0;
-    for observation in episode.observations.chunks_exact_mut(layout.n_observation()) {
+    for observation in episode.observations.chunks_exact_mut(task.n_observation()) {
         observation[x] = position;
         position += drift_m;
     }
@@ -37,7 +37,7 @@ fn small_config() -> RunConfig {
 fn train_round(trainer: &mut Trainer) -> RoundStats {
     let round = trainer.counters().round;
     let episodes: Vec<_> = (round * 2..round * 2 + 2)
-        .map(|number| drifting_episode(&trainer.layout, number, 0.002 * number as f32))
+        .map(|number| drifting_episode(&trainer.task, number, 0.002 * number as f32))
         .collect();
     trainer.ingest(&episodes);
     trainer.learn(|_| ()).expect("finite")
@@ -159,7 +159,7 @@ fn a_resumed_run_orders_the_round_with_the_horizon_that_it_had() {
     let mut trainer = Trainer::new(config.clone()).expect("valid");
     let play = |trainer: &mut Trainer, goal_m: f32| {
         let episode = |number| {
-            let mut episode = drifting_episode(&trainer.layout, number, 0.0);
+            let mut episode = drifting_episode(&trainer.task, number, 0.0);
             episode.goal.fill(if number % 10 == 0 { goal_m } else { 9.0 });
             Episode { queried_steps: Some(3), ..episode }
         };
@@ -414,7 +414,7 @@ fn load_hostile(name: &str, n_cases: u32, hostile: impl Strategy<Value = Vec<u8>
 fn train_with_whatever(trainer: &mut Trainer) {
     let round = trainer.counters().round;
     assert!(!trainer.training_orders(round, round).is_empty());
-    let episodes = [drifting_episode(&trainer.layout, round * 2, 0.01)];
+    let episodes = [drifting_episode(&trainer.task, round * 2, 0.01)];
     trainer.ingest(&episodes);
     // Numbers that are not finite make learning diverge, which is an error and not a panic.
     drop(trainer.learn(|_| ()));

@@ -90,8 +90,8 @@ impl InitialState {
         }
         let address =
             config.teacher.as_deref().ok_or_else(|| Error::NoTeacher(advice.strategy.clone()))?;
-        let layout = &self.trainer.layout;
-        let one_arm = layout.single_arm().expect("checked: an advised task has a task of one arm");
+        let task = &self.trainer.task;
+        let one_arm = task.single_arm().expect("checked: an advised task has a task of one arm");
         let options = AccountOptions {
             client_config: &config.client_config,
             address,
@@ -118,7 +118,7 @@ impl InitialState {
 
 /// Checks that a worker can send the episodes of every slot in one message.
 fn check_slots(trainer: &Trainer) -> Result<(), Error> {
-    let max_episode_bytes = max_episode_bytes(&trainer.layout);
+    let max_episode_bytes = max_episode_bytes(&trainer.task);
     let check = |order: &SlotOrder| {
         let n_bytes = SUBMISSION_OVERHEAD_BYTES + order.episodes.len() * max_episode_bytes;
         if n_bytes > MAX_MESSAGE_BYTES {
@@ -170,7 +170,7 @@ impl<'a> LearnerLoop<'a> {
         let renamed_account = account.as_ref().and_then(AdviceAccount::renamed).or(renamed);
         let terms = RunTerms {
             run: config.run.name.clone(),
-            layout: trainer.layout.clone(),
+            task: trainer.task.clone(),
             account: account.as_ref().map(|account| account.name().to_owned()),
             advice: config.run.advice.terms(),
             exploration: config.run.exploration,

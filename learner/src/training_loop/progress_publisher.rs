@@ -181,8 +181,8 @@ pub(super) fn budget_left(config: &LearnerConfig, at: Counters) -> u64 {
 
 /// Adds the steps of an episode to the counts of its arms.
 fn count_acted(acted: &mut Vec<ActedSteps>, episode: &Episode) {
-    acted.resize(acted.len().max(episode.layout.n_arms()), ActedSteps::default());
-    for (arm, counts) in acted.iter_mut().enumerate().take(episode.layout.n_arms()) {
+    acted.resize(acted.len().max(episode.task.n_arms()), ActedSteps::default());
+    for (arm, counts) in acted.iter_mut().enumerate().take(episode.task.n_arms()) {
         let is_teachers = |arms: &&u8| (u32::from(**arms) >> arm) & 1 == 1;
         let n_teacher = episode.advised_arms.iter().filter(is_teachers).count() as u64;
         counts.teacher += n_teacher;

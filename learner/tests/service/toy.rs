@@ -69,7 +69,7 @@ fn play_episode(actor: &mut Actor, slot: &SlotOrder, order: EpisodeOrder) -> Epi
         number: order.number,
         kind: slot.kind,
         parameter_version: slot.parameter_version,
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         observations,
         goal,
         actions,

@@ -28,8 +28,8 @@ fn a_policy_that_is_exported_and_imported_has_the_same_digest() {
         let policy = shipped(name);
         let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
         let critic = Model::decode(&export::critic(&policy).unwrap()).unwrap();
-        assert_eq!(crate::binding::layout_of(&actor, Role::Actor).unwrap(), policy.layout);
-        let imported = import(&actor, Some(&critic), &policy.layout).unwrap();
+        assert_eq!(crate::binding::task_of(&actor, Role::Actor).unwrap(), policy.task);
+        let imported = import(&actor, Some(&critic), &policy.task).unwrap();
         assert_eq!(imported.digest(), policy.digest(), "{name}");
         let kept =
             policy.metadata.iter().all(|(key, value)| imported.metadata.get(key) == Some(value));
@@ -43,10 +43,10 @@ fn a_model_of_a_task_that_is_not_built_in_describes_it() {
     let mut policy = shipped("teacher-push-classic");
     let description =
         TaskDescription { name: "lab/reach".to_owned(), tolerance: 0.1, ..LAYOUT.description() };
-    policy.layout = TaskSpec::new(description).unwrap();
+    policy.task = TaskSpec::new(description).unwrap();
     let mut actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
-    let layout = |actor: &Model| crate::binding::layout_of(actor, Role::Actor);
-    assert_eq!(layout(&actor).unwrap(), policy.layout);
+    let task = |actor: &Model| crate::binding::task_of(actor, Role::Actor);
+    assert_eq!(task(&actor).unwrap(), policy.task);
     assert!(!actor.metadata.contains_key("control_step_s"), "unknown of another task");
 
     let built_in = Model::decode(&export::actor(&shipped("teacher-push-classic")).unwrap());
@@ -55,7 +55,7 @@ fn a_model_of_a_task_that_is_not_built_in_describes_it() {
     let without = |key: &str| {
         let mut actor = Model::decode(&export::actor(&shipped("teacher-push")).unwrap()).unwrap();
         actor.metadata.remove(key);
-        layout(&actor).unwrap_err().to_string()
+        task(&actor).unwrap_err().to_string()
     };
     let missing = |present: &str, missing: &str| {
         format!("metadata {present:?} is present, {missing:?} is missing")
@@ -65,10 +65,10 @@ fn a_model_of_a_task_that_is_not_built_in_describes_it() {
 
     for (text, problem) in [
         ("{}", "missing field"),
-        (&json!(policy.layout.description()).to_string().replace("0.1", "-1.0"), "tolerance"),
+        (&json!(policy.task.description()).to_string().replace("0.1", "-1.0"), "tolerance"),
     ] {
         actor.metadata.insert(metadata::TASK_DESCRIPTION.to_owned(), text.to_owned());
-        let message = layout(&actor).unwrap_err().to_string();
+        let message = task(&actor).unwrap_err().to_string();
         assert!(message.contains("expected the description of a task: "), "{message}");
         assert!(message.contains(problem), "{message}");
     }
@@ -86,7 +86,7 @@ fn a_model_names_the_duration_of_a_control_step_of_its_world() {
 fn a_policy_without_a_critic_says_so_and_values_nothing() {
     let policy = shipped("teacher-push-classic");
     let actor = Model::decode(&export::actor(&policy).unwrap()).unwrap();
-    let imported = import(&actor, None, &policy.layout).unwrap();
+    let imported = import(&actor, None, &policy.task).unwrap();
     assert_eq!(imported.actor, policy.actor);
     assert!(!imported.has_critic() && policy.has_critic());
     assert!(imported.critic.iter().all(|weight| *weight == 0.0));
@@ -142,15 +142,14 @@ fn model(inputs: &[(&str, usize)], ops: &[Op], steps: Vec<Step>) -> Model {
 /// Compares the models with their policy on random states, up to 1000 times the unit.
 fn assert_same(actor: &Model, critic: &Model, policy: &Policy) {
     const N_ROWS: usize = 40;
-    let layout = &policy.layout;
+    let task = &policy.task;
     let mut rng = episode_rng(9, 0, Stream::Reset);
     let mut draw = |n: usize, scale: f32| -> Vec<f32> {
         (0..N_ROWS * n).map(|_| uniform(&mut rng, -scale, scale)).collect()
     };
     for scale in [0.5, 20.0, 1000.0] {
-        let (observations, goals) =
-            (draw(layout.n_observation(), scale), draw(layout.n_goal(), scale));
-        let actions = draw(layout.n_action(), 1.0);
+        let (observations, goals) = (draw(task.n_observation(), scale), draw(task.n_goal(), scale));
+        let actions = draw(task.n_action(), 1.0);
         let check = |what: &str, got: &[f32], expected: &[f32]| {
             for (got, expected) in got.iter().zip(expected) {
                 let tolerance = 2e-5 * expected.abs().max(1.0);
@@ -159,13 +158,13 @@ fn assert_same(actor: &Model, critic: &Model, policy: &Policy) {
         };
         let mut expected = vec![0.0; actions.len()];
         let mut got = expected.clone();
-        let mut bound = BoundNetwork::new(actor, Role::Actor, layout).unwrap();
+        let mut bound = BoundNetwork::new(actor, Role::Actor, task).unwrap();
         bound.run(&observations, &goals, &[], &mut expected);
         policy.actor().unwrap().act(&observations, &goals, &mut got);
         check("action", &got, &expected);
         let mut expected = vec![0.0; N_ROWS * policy.n_heads];
         let mut got = expected.clone();
-        let mut bound = BoundNetwork::new(critic, Role::Critic, layout).unwrap();
+        let mut bound = BoundNetwork::new(critic, Role::Critic, task).unwrap();
         bound.run(&observations, &goals, &actions, &mut expected);
         policy.critic().unwrap().q(&observations, &goals, &actions, &mut got);
         check("value", &got, &expected);
@@ -203,9 +202,9 @@ fn wide_clips_and_wide_observations_are_kept() {
     let mut description = TaskDescription { name: "lab/mm".to_owned(), ..LAYOUT.description() };
     description.observation_bound[0] = 5000.0;
     description.observation_bound[1] = f32::MAX;
-    let layout = TaskSpec::new(description).unwrap();
+    let task = TaskSpec::new(description).unwrap();
     let unclipped = model(&[("x", 31)], &[], steps(&[31, 8, 3], Some(Op::Tanh), 9));
-    let policy = import(&unclipped, None, &layout).unwrap();
+    let policy = import(&unclipped, None, &task).unwrap();
     let stds = &policy.observation_normalizer.std;
     assert_eq!([stds[0], stds[2]], [1024.0, 256.0]);
     assert!(0.01 / stds[1] > 1e-30, "{}: ordinary numbers remain normal floats", stds[1]);
@@ -283,7 +282,7 @@ fn networks_that_a_policy_file_cannot_represent_are_refused() {
 }
 
 #[test]
-fn inputs_that_do_not_fit_the_layout_are_named() {
+fn inputs_that_do_not_fit_the_task_are_named() {
     let check = |inputs: &[(&str, usize)], n_out: usize, role, expected: &str| {
         let n_in = inputs.iter().map(|(_, width)| width).sum();
         let model = model(inputs, &[], steps(&[n_in, 4, n_out], None, 1));

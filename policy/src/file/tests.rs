@@ -63,7 +63,7 @@ fn a_policy_of_another_task_is_saved_with_its_description() {
     policy.save(&path).unwrap();
     let loaded = Policy::load(&path).unwrap();
     assert_eq!(loaded, policy);
-    assert_eq!(loaded.layout.tolerance(), 0.1);
+    assert_eq!(loaded.task.tolerance(), 0.1);
     let version = |policy: &Policy| metadata(policy)["format_version"].clone();
     assert_eq!((version(&policy), version(&sample())), ("2".to_owned(), "1".to_owned()));
     assert!(!metadata(&sample()).contains_key("description"));

@@ -24,13 +24,13 @@ impl QueryGate {
     /// Creates the gate that was published beside an actor; `None` if there is none.
     ///
     /// # Errors
-    /// Returns an error if a size is out of range, a vector does not have the length that follows from `layout` and the
+    /// Returns an error if a size is out of range, a vector does not have the length that follows from `task` and the
     /// sizes, a number is not finite, or a standard deviation is not above 0.
-    pub fn new(layout: &TaskSpec, published: &PublishedActor) -> Result<Option<Self>, Error> {
+    pub fn new(task: &TaskSpec, published: &PublishedActor) -> Result<Option<Self>, Error> {
         let Some(gate) = &published.gate else { return Ok(None) };
         let PublishedGate { n_critics, n_hidden, n_hidden_layers, n_heads, threshold, .. } = *gate;
         check_network_size(n_hidden, n_hidden_layers)?;
-        let shape = MlpShape::critic(layout, n_hidden, n_hidden_layers, n_heads);
+        let shape = MlpShape::critic(task, n_hidden, n_hidden_layers, n_heads);
         let n_parameters = shape.n_parameters();
         check_parameters("gate", &gate.critics, n_critics * n_parameters)?;
         let snapshot = |mean: &[f32], std: &[f32]| NormalizerSnapshot {
@@ -40,7 +40,7 @@ impl QueryGate {
         let critic = |parameters: &[f32]| {
             let observation = snapshot(&published.observation_mean, &published.observation_std);
             let goal = snapshot(&published.goal_mean, &published.goal_std);
-            Critic::new(layout, &shape, parameters, observation, goal)
+            Critic::new(task, &shape, parameters, observation, goal)
         };
         let critics: Vec<Critic> =
             gate.critics.chunks_exact(n_parameters).map(critic).collect::<Result<_, _>>()?;
@@ -52,7 +52,7 @@ impl QueryGate {
     /// `goal` `[n_goal]`.
     ///
     /// # Panics
-    /// If the lengths do not match the layout.
+    /// If the lengths do not match the task.
     pub fn asks(&mut self, observation: &[f32], goal: &[f32], action: &[f32]) -> bool {
         let Some(n_heads) = self.critics.first().map(Critic::n_heads) else { return true };
         for (critic, values) in self.critics.iter_mut().zip(self.values.chunks_exact_mut(n_heads)) {
@@ -119,12 +119,12 @@ mod tests {
 
     #[test]
     fn an_actor_without_a_gate_has_none_and_a_gate_that_does_not_fit_is_refused() {
-        let layout = TaskSpec::from(LAYOUT);
+        let task = TaskSpec::from(LAYOUT);
         let without = Policy::sample(LAYOUT, 2).published(1);
-        assert!(QueryGate::new(&layout, &without).unwrap().is_none());
+        assert!(QueryGate::new(&task, &without).unwrap().is_none());
         let mut published = published([[0.0; 2]; 3], 0.5);
         published.gate.as_mut().expect("a gate").critics.pop();
-        let error = QueryGate::new(&layout, &published).expect_err("must be refused").to_string();
+        let error = QueryGate::new(&task, &published).expect_err("must be refused").to_string();
         assert!(error.starts_with("gate has 857 numbers, expected 858"), "{error}");
     }
 }

@@ -25,19 +25,19 @@ pub fn encode_episode(episode: &Episode) -> pb::Episode {
     }
 }
 
-/// Decodes an episode of a run with `layout`.
+/// Decodes an episode of a run of `task`.
 ///
 /// # Errors
-/// Returns an error if the kind is unknown, a length does not match the layout, a number is not finite or beyond its
+/// Returns an error if the kind is unknown, a length does not match the task, a number is not finite or beyond its
 /// bound (see [`tandem_core::bounds`]), an action is outside [−1, 1], an undefined bit of `advised_arms` or `contacts`
 /// is set, or more units were charged, or avoidance steps or queries counted, than the episode has steps.
 pub fn decode_episode(
     episode: pb::Episode,
-    layout: impl Into<TaskSpec>,
+    task: impl Into<TaskSpec>,
 ) -> Result<Episode, DecodeError> {
-    let layout = layout.into();
-    let n_steps = layout.episode_steps();
-    let n_observations = (n_steps + 1) * layout.n_observation();
+    let task = task.into();
+    let n_steps = task.episode_steps();
+    let n_observations = (n_steps + 1) * task.n_observation();
     let max_count = u32::try_from(n_steps).expect("an episode has few steps");
     let counted_steps = |field, count: Option<u32>| {
         count.map(|count| count_within(field, count, &(0..=max_count))).transpose()
@@ -52,28 +52,26 @@ pub fn decode_episode(
             "observations",
             &episode.observations,
             n_observations,
-            |idx| layout.observation_bound(idx % layout.n_observation()),
+            |idx| task.observation_bound(idx % task.n_observation()),
         )?,
-        goal: bounded_from_bytes("goal", &episode.goal, layout.n_goal(), |idx| {
-            layout.goal_bound(idx)
-        })?,
-        actions: actions_from_bytes("actions", &episode.actions, n_steps * layout.n_action())?,
-        advised_arms: decode_advised_arms(episode.advised_arms, &layout)?,
+        goal: bounded_from_bytes("goal", &episode.goal, task.n_goal(), |idx| task.goal_bound(idx))?,
+        actions: actions_from_bytes("actions", &episode.actions, n_steps * task.n_action())?,
+        advised_arms: decode_advised_arms(episode.advised_arms, &task)?,
         contacts: decode_contacts(&episode.contacts, n_steps)?,
         advice_charged: count_within("advice_charged", episode.advice_charged, &(0..=max_count))?,
         avoidance_steps,
         queried_steps,
-        layout,
+        task,
     })
 }
 
-fn decode_advised_arms(advised_arms: Vec<u8>, layout: &TaskSpec) -> Result<Vec<u8>, DecodeError> {
-    check_one_per_step("advised_arms", &advised_arms, layout.episode_steps())?;
-    let names_an_arm = |bits: u8| (u32::from(bits) >> layout.n_arms()) == 0;
+fn decode_advised_arms(advised_arms: Vec<u8>, task: &TaskSpec) -> Result<Vec<u8>, DecodeError> {
+    check_one_per_step("advised_arms", &advised_arms, task.episode_steps())?;
+    let names_an_arm = |bits: u8| (u32::from(bits) >> task.n_arms()) == 0;
     match advised_arms.iter().position(|bits| !names_an_arm(*bits)) {
         None => Ok(advised_arms),
         Some(step_idx) => {
-            let expected = format_args!("bits of {} arms", layout.n_arms()).to_string();
+            let expected = format_args!("bits of {} arms", task.n_arms()).to_string();
             let got = format_args!("{:#010b}", advised_arms[step_idx]).to_string();
             Err(DecodeError::new(format!("advised_arms[{step_idx}]"), expected, got))
         }
@@ -122,7 +120,7 @@ mod tests {
             number: 7,
             kind: EpisodeKind::Training,
             parameter_version: 3,
-            layout: LAYOUT.into(),
+            task: LAYOUT.into(),
             observations: ramp(51 * 56),
             goal: ramp(6),
             actions: ramp(50 * 6),
@@ -184,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn an_episode_of_another_layout_is_refused() {
+    fn an_episode_of_another_task_is_refused() {
         assert!(
             decode_episode(encode_episode(&episode()), Layout::new(Task::PickAndPlace, 2)).is_err()
         );

@@ -48,20 +48,20 @@ fn encode_gate(gate: &PublishedGate) -> pb::Parameters {
     }
 }
 
-/// Decodes the parameters of an actor for `layout`.
+/// Decodes the parameters of an actor for `task`.
 ///
 /// # Errors
-/// Returns an error if a length does not match the layout and the network's size, a number is not finite, a standard
+/// Returns an error if a length does not match the task and the network's size, a number is not finite, a standard
 /// deviation is not positive or a message without critics has other fields of a gate.
 pub fn decode_actor(
     parameters: &pb::Parameters,
-    layout: impl Into<TaskSpec>,
+    task: impl Into<TaskSpec>,
 ) -> Result<PublishedActor, DecodeError> {
-    let layout = layout.into();
+    let task = task.into();
     let n_hidden = count_within("n_hidden", parameters.n_hidden, &(1..=MAX_HIDDEN))?;
     let n_layers = count_within("n_layers", parameters.n_layers, &(1..=MAX_HIDDEN_LAYERS))?;
     let (n_hidden, n_hidden_layers) = (to_usize(n_hidden), to_usize(n_layers));
-    let (n_observation, n_goal) = (layout.n_observation(), layout.n_goal());
+    let (n_observation, n_goal) = (task.n_observation(), task.n_goal());
     let std = |field, bytes, n| positive(field, finite_from_bytes(field, bytes, n)?, n);
     Ok(PublishedActor {
         version: parameters.version,
@@ -70,7 +70,7 @@ pub fn decode_actor(
         actor: finite_from_bytes(
             "actor",
             &parameters.actor,
-            n_parameters(&layout, n_hidden, n_hidden_layers),
+            n_parameters(&task, n_hidden, n_hidden_layers),
         )?,
         observation_mean: finite_from_bytes(
             "observation_mean",
@@ -80,14 +80,14 @@ pub fn decode_actor(
         observation_std: std("observation_std", &parameters.observation_std, n_observation)?,
         goal_mean: finite_from_bytes("goal_mean", &parameters.goal_mean, n_goal)?,
         goal_std: std("goal_std", &parameters.goal_std, n_goal)?,
-        gate: decode_gate(parameters, &layout)?,
+        gate: decode_gate(parameters, &task)?,
     })
 }
 
 /// Decodes the gate of an actor; `None` if it has none.
 fn decode_gate(
     parameters: &pb::Parameters,
-    layout: &TaskSpec,
+    task: &TaskSpec,
 ) -> Result<Option<PublishedGate>, DecodeError> {
     if parameters.n_critics == 0 {
         return without_gate(parameters).map(|()| None);
@@ -96,9 +96,9 @@ fn decode_gate(
     let n_critics = count_within("n_critics", parameters.n_critics, &(2..=MAX_CRITICS))?;
     let n_hidden = count("n_critic_hidden", parameters.n_critic_hidden, MAX_HIDDEN)?;
     let n_layers = count("n_critic_layers", parameters.n_critic_layers, MAX_HIDDEN_LAYERS)?;
-    let n_arms = u32::try_from(layout.n_arms()).expect("a layout has few arms");
+    let n_arms = u32::try_from(task.n_arms()).expect("a task has few arms");
     let n_heads = count("n_critic_heads", parameters.n_critic_heads, n_arms)?;
-    let n_input = layout.n_observation() + layout.n_goal() + layout.n_action();
+    let n_input = task.n_observation() + task.n_goal() + task.n_action();
     let n_critics = to_usize(n_critics);
     let n_parameters = n_critics * n_mlp_parameters([n_input, n_heads], n_hidden, n_layers);
     Ok(Some(PublishedGate {
@@ -126,10 +126,10 @@ fn without_gate(parameters: &pb::Parameters) -> Result<(), DecodeError> {
     }
 }
 
-/// Returns the number of parameters of an actor for `layout` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
+/// Returns the number of parameters of an actor for `task` with `n_hidden_layers >= 1` hidden layers of `n_hidden`
 /// units.
-fn n_parameters(layout: &TaskSpec, n_hidden: usize, n_hidden_layers: usize) -> usize {
-    let ends = [layout.n_observation() + layout.n_goal(), layout.n_action()];
+fn n_parameters(task: &TaskSpec, n_hidden: usize, n_hidden_layers: usize) -> usize {
+    let ends = [task.n_observation() + task.n_goal(), task.n_action()];
     n_mlp_parameters(ends, n_hidden, n_hidden_layers)
 }
 

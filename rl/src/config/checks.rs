@@ -17,15 +17,15 @@ impl RunConfig {
     /// # Errors
     /// Names the first setting that cannot be used, its value and its range.
     pub fn checked(self) -> Result<Self, ConfigError> {
-        let layout = self.layout()?;
+        let task = self.task_spec()?;
         self.check_run()?;
-        self.check_symmetrized(&layout)?;
-        self.check_advice(&layout)?;
+        self.check_symmetrized(&task)?;
+        self.check_advice(&task)?;
         self.check_rounds()?;
         self.check_stop()?;
-        self.exploration.check(layout.episode_steps())?;
+        self.exploration.check(task.episode_steps())?;
         self.world.check()?;
-        self.replay.check(&layout)?;
+        self.replay.check(&task)?;
         self.ddpg.check()?;
         Ok(self)
     }
@@ -50,16 +50,16 @@ impl RunConfig {
         check("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 0, "at least 1")
     }
 
-    fn check_symmetrized(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
+    fn check_symmetrized(&self, task: &TaskSpec) -> Result<(), OutOfRange> {
         let symmetrized = self.evaluation.symmetrized;
-        let is_usable = !symmetrized || layout.has_interchangeable_arms();
+        let is_usable = !symmetrized || task.has_interchangeable_arms();
         let expected = "false: the arms of this task are not interchangeable";
         check("evaluation.symmetrized", symmetrized, is_usable, expected)
     }
 
-    fn check_advice(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
+    fn check_advice(&self, task: &TaskSpec) -> Result<(), OutOfRange> {
         let strategy = self.advice.strategy.as_str();
-        let can_be_advised = !self.advice.needs_teacher() || layout.single_arm().is_some();
+        let can_be_advised = !self.advice.needs_teacher() || task.single_arm().is_some();
         let expected = "none for this task: its arms are not instances of one task of one arm";
         check("advice.strategy", strategy, can_be_advised, expected)?;
         OutOfRange::check_fraction("advice.share", self.advice.share)?;

@@ -83,20 +83,20 @@ impl RunConfig {
     ///
     /// Sources of [`Recipe::Paper`]: section 4 of the paper and the HER reference implementation (OpenAI baselines).
     #[must_use]
-    pub fn defaults_of(recipe: Recipe, layout: &TaskSpec) -> Self {
-        let (task, n_arms) = (layout.name(), layout.n_arms());
+    pub fn defaults_of(recipe: Recipe, task: &TaskSpec) -> Self {
+        let (task_name, n_arms) = (task.name(), task.n_arms());
         let tandem = recipe == Recipe::Tandem;
         Self {
-            name: format!("{}-{n_arms}", task.replace('/', "-")),
-            task: task.to_owned(),
+            name: format!("{}-{n_arms}", task_name.replace('/', "-")),
+            task: task_name.to_owned(),
             arms: n_arms,
             seed: 1,
             recipe,
             behaviour: Behaviour::Target,
             advice: AdviceConfig {
-                strategy: if n_arms == 1 || layout.single_arm().is_none() {
+                strategy: if n_arms == 1 || task.single_arm().is_none() {
                     "none"
-                } else if tandem && carries_past_others(layout) {
+                } else if tandem && carries_past_others(task) {
                     "mc-q:0.4"
                 } else {
                     "mc-q:0.1"
@@ -106,41 +106,41 @@ impl RunConfig {
                 budget_scope: if tandem { BudgetScope::Run } else { BudgetScope::Slot },
                 unit: if tandem { AdviceUnit::EnvStep } else { AdviceUnit::SlotStep },
                 judged_action: if tandem { JudgedAction::Executed } else { JudgedAction::Policy },
-                share: match (tandem, is_shared(layout)) {
+                share: match (tandem, is_shared(task)) {
                     // Of twice as many episodes as in push, half the share is as many advised ones.
-                    (true, true) if carries_past_others(layout) => 0.1,
+                    (true, true) if carries_past_others(task) => 0.1,
                     (true, true) => 0.2,
                     (true, false) => 0.5,
                     (false, _) => 1.0,
                 },
             },
-            rounds: rounds(recipe, layout),
+            rounds: rounds(recipe, task),
             exploration: Exploration {
                 noise_std: 0.2,
                 random_action_prob: 0.3,
                 sticky_random_mean_steps: if tandem {
-                    4.0_f32.min(layout.episode_steps() as f32)
+                    4.0_f32.min(task.episode_steps() as f32)
                 } else {
                     1.0
                 },
                 joint_random_actions: !tandem,
             },
-            world: world(recipe, layout),
-            replay: replay(recipe, layout),
-            ddpg: ddpg(recipe, layout),
+            world: world(recipe, task),
+            replay: replay(recipe, task),
+            ddpg: ddpg(recipe, task),
             evaluation: EvaluationConfig {
                 // The paper evaluates once per epoch.
-                every_env_steps: if tandem { 20_000 } else { paper_epoch_env_steps(layout) },
+                every_env_steps: if tandem { 20_000 } else { paper_epoch_env_steps(task) },
                 early_points: 4,
                 episodes: 240,
                 seed: 240_240,
                 recorded_episodes: 2,
                 test_episodes: 240,
-                symmetrized: tandem && layout.has_interchangeable_arms(),
+                symmetrized: tandem && task.has_interchangeable_arms(),
             },
-            stop: stop(recipe, layout),
+            stop: stop(recipe, task),
             checkpoint: CheckpointConfig { every_rounds: 50, keep: 2 },
-            description: layout.as_built_in().is_none().then(|| layout.description().clone()),
+            description: task.as_built_in().is_none().then(|| task.description().clone()),
         }
     }
 
@@ -154,20 +154,20 @@ impl RunConfig {
     }
 }
 
-fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
+fn rounds(recipe: Recipe, task: &TaskSpec) -> RoundsConfig {
     match recipe {
         Recipe::Tandem => RoundsConfig {
             slots: 8,
             rollouts: 2,
             lag: 1,
-            updates_per_env_step: match (is_shared(layout), layout.n_arms()) {
+            updates_per_env_step: match (is_shared(task), task.n_arms()) {
                 (true, 1) => 0.25,
                 (true, _) => 1.0,
                 (false, _) => 0.5,
             },
             polyak_every: PolyakEvery::Update,
             warmup_env_steps: 2000,
-            final_greedy_share: if carries_past_others(layout) { 0.5 } else { 0.0 },
+            final_greedy_share: if carries_past_others(task) { 0.5 } else { 0.0 },
             per_epoch: 50,
         },
         Recipe::Paper => RoundsConfig {
@@ -184,34 +184,34 @@ fn rounds(recipe: Recipe, layout: &TaskSpec) -> RoundsConfig {
 }
 
 /// Returns true if the task is a built-in one of the world `shared`.
-fn is_shared(layout: &TaskSpec) -> bool {
-    layout.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
+fn is_shared(task: &TaskSpec) -> bool {
+    task.as_built_in().is_some_and(|layout| layout.task.world() == World::Shared)
 }
 
 /// Returns true if arms carry objects through an area that they share, each its own. An arm whose way is blocked then
 /// has to wait until the other has made room (decisions 041 and 042).
-fn carries_past_others(layout: &TaskSpec) -> bool {
-    is_shared(layout) && grasps(layout) && layout.n_arms() > 1
+fn carries_past_others(task: &TaskSpec) -> bool {
+    is_shared(task) && grasps(task) && task.n_arms() > 1
 }
 
 /// Returns true if the task is a built-in one in which arms grasp objects.
-fn grasps(layout: &TaskSpec) -> bool {
-    layout.as_built_in().is_some_and(|layout| layout.task.grasps())
+fn grasps(task: &TaskSpec) -> bool {
+    task.as_built_in().is_some_and(|layout| layout.task.grasps())
 }
 
 /// Returns the environment steps of the paper's epoch: 80,000 in the built-in tasks, whose episodes have 50 steps.
-fn paper_epoch_env_steps(layout: &TaskSpec) -> u64 {
+fn paper_epoch_env_steps(task: &TaskSpec) -> u64 {
     let n_episodes = (PAPER_SLOTS * PAPER_ROLLOUTS) as u64;
-    PAPER_EPOCH_ROUNDS * n_episodes * layout.episode_steps() as u64
+    PAPER_EPOCH_ROUNDS * n_episodes * task.episode_steps() as u64
 }
 
 /// Limits of the paper's recipe: 50 epochs with one arm and 900 with more, since the paper's slowest curves reach 90 %
 /// after 43 and 898.
-fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
-    let max_env_steps = match (recipe, layout.as_built_in()) {
-        (Recipe::Paper, _) if layout.n_arms() == 1 => 50 * paper_epoch_env_steps(layout),
-        (Recipe::Paper, _) => 900 * paper_epoch_env_steps(layout),
-        (Recipe::Tandem, Some(built_in)) if is_shared(layout) => {
+fn stop(recipe: Recipe, task: &TaskSpec) -> StopConfig {
+    let max_env_steps = match (recipe, task.as_built_in()) {
+        (Recipe::Paper, _) if task.n_arms() == 1 => 50 * paper_epoch_env_steps(task),
+        (Recipe::Paper, _) => 900 * paper_epoch_env_steps(task),
+        (Recipe::Tandem, Some(built_in)) if is_shared(task) => {
             match (built_in.n_arms, built_in.task.grasps()) {
                 (1, false) => 100_000,
                 (1, true) | (_, false) => 200_000,
@@ -224,10 +224,10 @@ fn stop(recipe: Recipe, layout: &TaskSpec) -> StopConfig {
     StopConfig { until_success: 0.0, max_env_steps, max_minutes: 0.0 }
 }
 
-fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
+fn world(recipe: Recipe, task: &TaskSpec) -> WorldSettings {
     let tandem = recipe == Recipe::Tandem;
-    let starts_grasped = tandem && grasps(layout);
-    let shares_object = layout.shares_object();
+    let starts_grasped = tandem && grasps(task);
+    let shares_object = task.shares_object();
     WorldSettings {
         grasped_start_prob: match starts_grasped {
             true if shares_object => 0.5,
@@ -235,25 +235,25 @@ fn world(recipe: Recipe, layout: &TaskSpec) -> WorldSettings {
             false => 0.0,
         },
         grasped_start_env_steps: if starts_grasped && shares_object { 150_000 } else { 0 },
-        randomization: if tandem && is_shared(layout) { 1.0 } else { 0.0 },
+        randomization: if tandem && is_shared(task) { 1.0 } else { 0.0 },
         ..WorldSettings::default()
     }
 }
 
-fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
+fn replay(recipe: Recipe, task: &TaskSpec) -> ReplayConfig {
     let tandem = recipe == Recipe::Tandem;
-    let avoids_contacts = tandem && layout.n_arms() > 1 && layout.reports_contacts();
-    let tolerance = layout.tolerance();
-    let pair_shares_table = avoids_contacts && is_shared(layout);
+    let avoids_contacts = tandem && task.n_arms() > 1 && task.reports_contacts();
+    let tolerance = task.tolerance();
+    let pair_shares_table = avoids_contacts && is_shared(task);
     ReplayConfig {
         capacity_transitions: 1_000_000,
         her_ratio: 0.8,
-        displaced_hindsight: layout.shares_object(),
+        displaced_hindsight: task.shares_object(),
         displaced_fraction: if tandem { 0.5 } else { 0.0 },
-        coda_fraction: if tandem && layout.has_recombinable_arms() { 1.0 } else { 0.0 },
+        coda_fraction: if tandem && task.has_recombinable_arms() { 1.0 } else { 0.0 },
         coda_contact_prob: 0.0,
-        arm_swap_prob: if tandem && layout.has_interchangeable_arms() { 0.5 } else { 0.0 },
-        reflection_prob: if tandem && layout.has_reflection() { 0.5 } else { 0.0 },
+        arm_swap_prob: if tandem && task.has_interchangeable_arms() { 0.5 } else { 0.0 },
+        reflection_prob: if tandem && task.has_reflection() { 0.5 } else { 0.0 },
         reward: if tandem { RewardKind::PerArm } else { RewardKind::Joint },
         joint_goal_statistics: !tandem,
         // Four or three fifths of the tolerance; of 0.05 m exactly 0.04 or 0.03 m.
@@ -268,7 +268,7 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
             (false, true) => 1.0,
             // One arm of the shared world learns not to press.
             (false, false) => {
-                if tandem && is_shared(layout) {
+                if tandem && is_shared(task) {
                     1.0
                 } else {
                     0.0
@@ -279,15 +279,15 @@ fn replay(recipe: Recipe, layout: &TaskSpec) -> ReplayConfig {
         contact_foresight_steps: match (pair_shares_table, avoids_contacts) {
             // Near arms count as contacts, so more steps would leave little advice to clone.
             (true, _) => 1,
-            (false, true) => 5.min(layout.episode_steps()),
+            (false, true) => 5.min(task.episode_steps()),
             (false, false) => 0,
         },
     }
 }
 
-fn ddpg(recipe: Recipe, layout: &TaskSpec) -> DdpgConfig {
-    let (tandem, n_arms) = (recipe == Recipe::Tandem, layout.n_arms());
-    let pair_shares_table = tandem && n_arms > 1 && is_shared(layout);
+fn ddpg(recipe: Recipe, task: &TaskSpec) -> DdpgConfig {
+    let (tandem, n_arms) = (recipe == Recipe::Tandem, task.n_arms());
+    let pair_shares_table = tandem && n_arms > 1 && is_shared(task);
     DdpgConfig {
         n_hidden: if pair_shares_table { N_HIDDEN / 2 } else { N_HIDDEN },
         n_hidden_layers: n_hidden_layers(n_arms),

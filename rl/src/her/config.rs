@@ -18,10 +18,10 @@ pub enum RewardKind {
 impl RewardKind {
     /// Returns the number of the critic's heads.
     #[must_use]
-    pub fn n_heads(self, layout: &TaskSpec) -> usize {
+    pub fn n_heads(self, task: &TaskSpec) -> usize {
         match self {
             Self::Joint => 1,
-            Self::PerArm => layout.n_arms(),
+            Self::PerArm => task.n_arms(),
         }
     }
 }
@@ -97,7 +97,7 @@ impl ReplayConfig {
     ///
     /// # Errors
     /// Names the first setting that is out of its range.
-    pub fn check(&self, layout: &TaskSpec) -> Result<(), OutOfRange> {
+    pub fn check(&self, task: &TaskSpec) -> Result<(), OutOfRange> {
         let fractions = [
             ("replay.her_ratio", self.her_ratio),
             ("replay.displaced_fraction", self.displaced_fraction),
@@ -110,7 +110,7 @@ impl ReplayConfig {
             OutOfRange::check_fraction(key, value)?;
         }
         let (key, tolerance_m) = ("replay.goal_tolerance_m", self.goal_tolerance_m);
-        if layout.as_built_in().is_some() {
+        if task.as_built_in().is_some() {
             OutOfRange::check_range(key, tolerance_m, 1e-4..=1.0)?;
         }
         let is_tolerance = tolerance_m.is_finite() && tolerance_m > 0.0;
@@ -119,21 +119,21 @@ impl ReplayConfig {
         let (key, growth) = ("replay.contact_cost_growth", self.contact_cost_growth);
         OutOfRange::check_range(key, growth, 1.0..=100.0)?;
         let (key, n_steps) = ("replay.contact_foresight_steps", self.contact_foresight_steps);
-        let n_max = layout.episode_steps();
+        let n_max = task.episode_steps();
         OutOfRange::unless(n_steps <= n_max, key, n_steps, format_args!("0 to {n_max}"))?;
         let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
         OutOfRange::unless(capacity >= n_max, key, capacity, format_args!("at least {n_max}"))?;
         let symmetry = "0 for this task, whose arms are not interchangeable";
         let (key, prob) = ("replay.arm_swap_prob", self.arm_swap_prob);
-        let is_usable = prob == 0.0 || layout.n_arms() == 1 || layout.has_interchangeable_arms();
+        let is_usable = prob == 0.0 || task.n_arms() == 1 || task.has_interchangeable_arms();
         OutOfRange::unless(is_usable, key, prob, symmetry)?;
         let recombination = "0 for this task, whose arms cannot be recombined";
         let (key, fraction) = ("replay.coda_fraction", self.coda_fraction);
-        let is_usable = fraction == 0.0 || layout.n_arms() != 2 || layout.has_recombinable_arms();
+        let is_usable = fraction == 0.0 || task.n_arms() != 2 || task.has_recombinable_arms();
         OutOfRange::unless(is_usable, key, fraction, recombination)?;
         let unknown = "0 for this task, which does not describe when hands are in contact";
         let (key, prob) = ("replay.coda_contact_prob", self.coda_contact_prob);
-        let is_usable = prob == 0.0 || layout.n_arms() != 2 || layout.describes_contacts();
+        let is_usable = prob == 0.0 || task.n_arms() != 2 || task.describes_contacts();
         OutOfRange::unless(is_usable, key, prob, unknown)
     }
 }

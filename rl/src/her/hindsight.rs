@@ -13,36 +13,36 @@ use super::ReplayConfig;
 /// It always draws two numbers.
 pub(super) fn sample_later_step<'a>(
     config: &ReplayConfig,
-    layout: &TaskSpec,
+    task: &TaskSpec,
     observation: impl Fn(usize) -> &'a [f32],
     step_idx: usize,
     rng: &mut ChaCha8Rng,
 ) -> Option<usize> {
     let has_hindsight = bernoulli(rng, config.her_ratio);
-    let later_step = step_idx + 1 + index(rng, layout.episode_steps() - step_idx);
+    let later_step = step_idx + 1 + index(rng, task.episode_steps() - step_idx);
     let is_goal =
-        !config.displaced_hindsight || layout.is_displaced(observation(0), observation(later_step));
+        !config.displaced_hindsight || task.is_displaced(observation(0), observation(later_step));
     (has_hindsight && is_goal).then_some(later_step)
 }
 
 /// Returns the goal of step `step_idx` of an episode, relabelled as in a batch, shape `[n_goal]`.
 pub(crate) fn relabelled_goal(
     config: &ReplayConfig,
-    layout: &TaskSpec,
+    task: &TaskSpec,
     episode: &Episode,
     step_idx: usize,
     rng: &mut ChaCha8Rng,
 ) -> Vec<f32> {
     let mut goal = episode.goal.clone();
     let observation = |step_idx| episode.observation(step_idx);
-    let mut sample = || sample_later_step(config, layout, observation, step_idx, rng);
-    let joint = (config.joint_goal_statistics || layout.shares_object()).then(&mut sample);
-    for arm in layout.arms() {
+    let mut sample = || sample_later_step(config, task, observation, step_idx, rng);
+    let joint = (config.joint_goal_statistics || task.shares_object()).then(&mut sample);
+    for arm in task.arms() {
         let Some(later_step) = joint.unwrap_or_else(&mut sample) else { continue };
         let achieved = episode.observation(later_step);
-        layout.goal_of(arm).copy_from(&mut goal, layout.achieved_goal_of(arm), achieved);
+        task.goal_of(arm).copy_from(&mut goal, task.achieved_goal_of(arm), achieved);
         if arm.0 == 0 {
-            layout.common_goal().copy_from(&mut goal, layout.common_achieved_goal(), achieved);
+            task.common_goal().copy_from(&mut goal, task.common_achieved_goal(), achieved);
         }
     }
     goal

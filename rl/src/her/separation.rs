@@ -11,27 +11,28 @@ type Point = [f32; 2];
 /// With positions along one axis only, the gap is that along this axis. With positions in the plane, it is that between
 /// the segments from each arm's base to its first position, and between every position of one arm and every position of
 /// the other: arms may cross the middle side by side.
-pub(super) fn are_apart(layout: &TaskSpec, observations: [&[f32]; 2]) -> bool {
-    let task = layout.description();
-    if layout.lateral_of(ArmIndex(0)).is_empty() {
+pub(super) fn are_apart(task: &TaskSpec, observations: [&[f32]; 2]) -> bool {
+    let description = task.description();
+    if task.lateral_of(ArmIndex(0)).is_empty() {
         let reach = |arm: usize| {
-            let positions = layout.position_of(ArmIndex(arm)).iter();
+            let positions = task.position_of(ArmIndex(arm)).iter();
             positions.map(|idx| observations[arm][idx]).fold(f32::NEG_INFINITY, f32::max)
         };
-        return task.origin_distance - (reach(0) + reach(1)) >= task.recombination_gap;
+        return description.origin_distance - (reach(0) + reach(1))
+            >= description.recombination_gap;
     }
     let bases = [
-        in_plane(task.origin_distance, 0, [task.base, 0.0]),
-        in_plane(task.origin_distance, 1, [task.base, 0.0]),
+        in_plane(description.origin_distance, 0, [description.base, 0.0]),
+        in_plane(description.origin_distance, 1, [description.base, 0.0]),
     ];
     let points = |arm: usize| {
         let indices =
-            layout.position_of(ArmIndex(arm)).iter().zip(layout.lateral_of(ArmIndex(arm)).iter());
+            task.position_of(ArmIndex(arm)).iter().zip(task.lateral_of(ArmIndex(arm)).iter());
         indices.map(move |(x, y)| {
-            in_plane(task.origin_distance, arm, [observations[arm][x], observations[arm][y]])
+            in_plane(description.origin_distance, arm, [observations[arm][x], observations[arm][y]])
         })
     };
-    let squared_gap = task.recombination_gap * task.recombination_gap;
+    let squared_gap = description.recombination_gap * description.recombination_gap;
     let hands = [points(0).next(), points(1).next()];
     let [Some(first_hand), Some(second_hand)] = hands else { return false };
     squared_distance([bases[0], first_hand], [bases[1], second_hand]) >= squared_gap
@@ -42,18 +43,18 @@ pub(super) fn are_apart(layout: &TaskSpec, observations: [&[f32]; 2]) -> bool {
 
 /// Returns true if the hands of the first arm as in the first observation and of the second arm as in the second one are
 /// so near to each other that they are in contact, as far as the task says.
-pub(super) fn would_touch(layout: &TaskSpec, observations: [&[f32]; 2]) -> bool {
-    let task = layout.description();
-    if task.contact_distances.is_empty() {
+pub(super) fn would_touch(task: &TaskSpec, observations: [&[f32]; 2]) -> bool {
+    let description = task.description();
+    if description.contact_distances.is_empty() {
         return false;
     }
     let [first, second] = [ArmIndex(0), ArmIndex(1)].map(|arm| {
-        let hand = layout.hand_of(arm).of(observations[arm.0]);
-        let [x, y] = in_plane(task.origin_distance, arm.0, [hand[0], hand[1]]);
+        let hand = task.hand_of(arm).of(observations[arm.0]);
+        let [x, y] = in_plane(description.origin_distance, arm.0, [hand[0], hand[1]]);
         [x, y, hand[2]]
     });
     let gaps = first.iter().zip(second).map(|(first, second)| (first - second).abs());
-    gaps.zip(&task.contact_distances).all(|(gap, distance)| gap < *distance)
+    gaps.zip(&description.contact_distances).all(|(gap, distance)| gap < *distance)
 }
 
 /// Converts a point from the frame of `arm` to that of the first arm. The arms face each other.

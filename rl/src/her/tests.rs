@@ -174,32 +174,32 @@ fn reflected_rows(
     reflection_prob: f32,
     change: impl Fn(&mut Episode),
 ) -> Vec<(bool, Batch)> {
-    let layout = TaskSpec::built_in(Task::SharedPickAndPlace, n_arms);
-    reflected_rows_of(&layout, reflection_prob, change)
+    let task = TaskSpec::built_in(Task::SharedPickAndPlace, n_arms);
+    reflected_rows_of(&task, reflection_prob, change)
 }
 
 /// As [`reflected_rows`], for another description of the task.
 fn reflected_rows_of(
-    layout: &TaskSpec,
+    task: &TaskSpec,
     reflection_prob: f32,
     change: impl Fn(&mut Episode),
 ) -> Vec<(bool, Batch)> {
-    let n_arms = layout.n_arms();
-    let mut episode = drifting_episode(layout, 0, 0.01);
+    let n_arms = task.n_arms();
+    let mut episode = drifting_episode(task, 0, 0.01);
     for (idx, value) in episode.observations.iter_mut().enumerate() {
-        *value += (idx % layout.n_observation()) as f32 * 1e-4;
+        *value += (idx % task.n_observation()) as f32 * 1e-4;
     }
     change(&mut episode);
-    let mut buffer = ReplayBuffer::new(layout, 1000);
+    let mut buffer = ReplayBuffer::new(task, 1000);
     buffer.push(&episode);
     let config = ReplayConfig { reflection_prob, arm_swap_prob: 0.0, ..config(RewardKind::PerArm) };
-    let mut sampler = Sampler::new(&config, layout);
+    let mut sampler = Sampler::new(&config, task);
     let identity = |n: usize| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
-    let (observation, goal) = (identity(layout.n_observation()), identity(layout.n_goal()));
+    let (observation, goal) = (identity(task.n_observation()), identity(task.n_goal()));
     let statistics = Statistics { observation: &observation, goal: &goal };
     (0..64)
         .map(|row| {
-            let mut batch = Batch::new(layout, n_arms, 1);
+            let mut batch = Batch::new(task, n_arms, 1);
             let mut rng = episode_rng(3, row, Stream::Replay);
             sampler.fill(&buffer, statistics, &mut rng, &mut batch);
             (sampler.sample.reflected, batch)
@@ -423,22 +423,22 @@ fn the_order_of_the_numbers_in_a_vector_changes_no_batch() {
     }
     original.goal = vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
     let rearranged = Episode {
-        layout: task.clone(),
+        task: task.clone(),
         observations: interleave(&original.observations, 56),
         goal: interleave(&original.goal, 6),
         actions: interleave(&original.actions, 6),
         ..original.clone()
     };
     let batch_of = |episode: &Episode, reward| {
-        let mut buffer = ReplayBuffer::new(&episode.layout, 1000);
+        let mut buffer = ReplayBuffer::new(&episode.task, 1000);
         buffer.push(episode);
         let config = ReplayConfig { coda_fraction: 0.5, ..config(reward) };
         let identity = |n| NormalizerSnapshot { mean: vec![0.0; n], std: vec![1.0; n] };
         let (observation, goal) = (identity(56), identity(6));
         let statistics = Statistics { observation: &observation, goal: &goal };
-        let mut batch = Batch::new(&episode.layout, reward.n_heads(&episode.layout), 200);
+        let mut batch = Batch::new(&episode.task, reward.n_heads(&episode.task), 200);
         let mut rng = episode_rng(3, 0, Stream::Replay);
-        Sampler::new(&config, &episode.layout).fill(&buffer, statistics, &mut rng, &mut batch);
+        Sampler::new(&config, &episode.task).fill(&buffer, statistics, &mut rng, &mut batch);
         batch
     };
     for reward in [RewardKind::PerArm, RewardKind::Joint] {

@@ -12,7 +12,7 @@ impl Trainer {
     pub fn training_orders(&self, round: u64, version: u64) -> Vec<SlotOrder> {
         let per_round = self.config.episodes_per_round();
         let warmup_env_steps = self.config.rounds.warmup_env_steps;
-        let warmup_episodes = warmup_env_steps.div_ceil(self.layout.episode_steps() as u64);
+        let warmup_episodes = warmup_env_steps.div_ceil(self.task.episode_steps() as u64);
         let greedy_share = self.config.at_round(round).greedy_share;
         let n_rounds_ahead = round.saturating_sub(self.counters.round);
         let advised_steps = self.jump_start.map(|jump_start| jump_start.horizon(n_rounds_ahead));

@@ -17,7 +17,7 @@ fn a_statistic_ruined_by_one_implausible_number_is_named() {
     config.ddpg.n_hidden = 4;
     let mut trainer = Trainer::new(config).expect("valid");
     assert_eq!(trainer.implausible_statistic(), None);
-    let mut row = vec![0.0; trainer.layout.n_observation()];
+    let mut row = vec![0.0; trainer.task.n_observation()];
     trainer.observation_normalizer.update(&row);
     row[31] = 25.0;
     trainer.observation_normalizer.update(&row);

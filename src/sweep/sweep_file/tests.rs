@@ -173,7 +173,7 @@ fn a_task_of_a_server_is_that_of_all_runs_and_part_of_their_names() {
     let runs = runs(&file, &settings).expect("valid");
     let names: Vec<&str> = runs.iter().map(|run| run.name.as_str()).collect();
     assert_eq!(names, ["lab-reach-1-mc-q-0.1-seed1", "lab-reach-1-mc-q-0.1-seed2"]);
-    assert_eq!(runs[0].config.layout().expect("valid"), task);
+    assert_eq!(runs[0].config.task_spec().expect("valid"), task);
     let environment = environment(&file).expect("valid");
     assert_eq!(environment.env_command.as_deref(), Some("serve"));
 }

@@ -18,7 +18,7 @@ pub(super) struct TeacherInference {
 
 impl TeacherInference {
     pub(super) fn new(policy: AnyPolicy) -> Self {
-        let n_action = policy.layout().n_action();
+        let n_action = policy.task().n_action();
         Self { policy, n_action, batch: Batch::default() }
     }
 

@@ -235,7 +235,7 @@ fn a_query_without_payer_shares_the_unit_of_queries_that_name_its_episode() {
 }
 
 #[test]
-fn one_request_may_hold_students_of_several_layouts() {
+fn one_request_may_hold_students_with_different_numbers_of_arms() {
     let mut advisor = advisor(10, "ea");
     let three_arms = StepQuery {
         episode: 2,
@@ -272,8 +272,8 @@ fn a_refused_request_charges_nothing() {
 struct Broken;
 
 impl TeacherPolicy for Broken {
-    fn layout(&self) -> TaskSpec {
-        FakePolicy.layout()
+    fn task(&self) -> TaskSpec {
+        FakePolicy.task()
     }
 
     fn digest(&self) -> &str {
@@ -409,8 +409,8 @@ fn the_strategy_of_an_account_is_cached() {
 struct Valueless;
 
 impl TeacherPolicy for Valueless {
-    fn layout(&self) -> TaskSpec {
-        FakePolicy.layout()
+    fn task(&self) -> TaskSpec {
+        FakePolicy.task()
     }
 
     fn digest(&self) -> &str {

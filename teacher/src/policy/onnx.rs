@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use tandem_core::TaskSpec;
-use tandem_onnx::binding::{Source, check_pair, layout_of, names_task};
+use tandem_onnx::binding::{Source, check_pair, names_task, task_of};
 use tandem_onnx::{BoundNetwork, Error as OnnxError, Model, ModelError, Role};
 
 use super::TeacherPolicy;
@@ -30,10 +30,10 @@ impl OnnxPolicy {
     /// their metadata says that they are parts of different policies.
     pub fn load(actor: &Path, critic: Option<&Path>) -> Result<Self, Error> {
         let model = Model::load(actor)?;
-        let layout = layout_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;
-        let bound = BoundNetwork::new(&model, Role::Actor, &layout);
+        let task = task_of(&model, Role::Actor).map_err(|source| refused(actor, source))?;
+        let bound = BoundNetwork::new(&model, Role::Actor, &task);
         let bound = bound.map_err(|source| refused(actor, source))?;
-        let n_arms = bound.layout().n_arms();
+        let n_arms = bound.task().n_arms();
         if n_arms != 1 {
             return Err(Error::NotOneArm { policy: shown(actor), n_arms });
         }
@@ -44,7 +44,7 @@ impl OnnxPolicy {
         let critic_model = Model::load(path)?;
         let checked = check_pair(&model, &critic_model);
         checked.map_err(|source| refused(path, source))?;
-        let critic = BoundNetwork::new(&critic_model, Role::Critic, layout);
+        let critic = BoundNetwork::new(&critic_model, Role::Critic, task);
         let critic = critic.map_err(|source| refused(path, source))?;
         check_critic(path, &critic)?;
         let digest = tandem_onnx::model::digest_of(&[&model.digest, &critic_model.digest]);
@@ -79,8 +79,8 @@ fn refused(path: &Path, source: ModelError) -> Error {
 }
 
 impl TeacherPolicy for OnnxPolicy {
-    fn layout(&self) -> TaskSpec {
-        self.actor.layout().clone()
+    fn task(&self) -> TaskSpec {
+        self.actor.task().clone()
     }
 
     fn digest(&self) -> &str {
@@ -137,7 +137,7 @@ mod tests {
             OneArmPolicy::load(&policy_file("teacher-push-classic.safetensors")).unwrap();
         let mut models = load(&actor, Some(&critic)).unwrap();
         let mut alone = load(&actor, None).unwrap();
-        assert_eq!(models.layout(), file.layout());
+        assert_eq!(models.task(), file.task());
         assert!(models.has_values() && file.has_values() && !alone.has_values());
         let digests = [file.digest(), models.digest(), alone.digest()];
         assert!(digests[0] != digests[1] && digests[1] != digests[2], "{digests:?}");

@@ -69,9 +69,8 @@ impl Policy for FakeServer {
         &self,
         _: Request<pb::DescribePolicyRequest>,
     ) -> Result<Response<pb::PolicyDescription>, Status> {
-        let layout = FakePolicy.layout();
         let task = pb::TaskDescription {
-            name: layout.name().to_owned(),
+            name: FakePolicy.task().name().to_owned(),
             n_observation: 28,
             n_goal: 3,
             n_action: 3,

@@ -56,13 +56,13 @@ fn check_count(field: &str, count: usize, max: usize) -> Result<(), DecodeError>
 }
 
 pub(super) fn describe(info: &TeacherInfo) -> pb::DescribeResponse {
-    let layout = &info.layout;
+    let task = &info.task;
     pb::DescribeResponse {
-        task_description: Some(encode_task(layout)),
-        task: layout.name().to_owned(),
-        n_observation_per_arm: index(layout.n_observation()),
-        n_goal_per_arm: index(layout.n_goal()),
-        n_action_per_arm: index(layout.n_action()),
+        task_description: Some(encode_task(task)),
+        task: task.name().to_owned(),
+        n_observation_per_arm: index(task.n_observation()),
+        n_goal_per_arm: index(task.n_goal()),
+        n_action_per_arm: index(task.n_action()),
         arms: info.maps.arms().iter().map(encode_map).collect(),
         strategies: Strategy::names(info.has_values).into_iter().map(str::to_owned).collect(),
         policy_digest: info.digest.clone(),

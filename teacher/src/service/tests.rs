@@ -86,7 +86,7 @@ fn refusal<T: std::fmt::Debug>(outcome: Result<T, Status>) -> (Code, String) {
 }
 
 #[tokio::test]
-async fn describe_returns_layout_maps_strategies_and_digest() {
+async fn describe_returns_task_maps_strategies_and_digest() {
     let mut fixture = Fixture::start().await;
     let description = fixture.client.describe(pb::DescribeRequest {}).await.unwrap().into_inner();
     assert_eq!(description.task, "push");

@@ -154,19 +154,19 @@ fn logs(directory: &Path) -> Vec<PathBuf> {
 
 /// Writes a log of 2 s with one arm.
 fn write_one_arm_log(path: &Path) -> PathBuf {
-    let layout = TaskSpec::from(Layout::new(Task::Push, 1));
+    let task = TaskSpec::from(Layout::new(Task::Push, 1));
     let mut scene = synthetic::scene(0.0);
     scene.arms.truncate(1);
     scene.objects.truncate(1);
     scene.goals.truncate(1);
-    let mut step = synthetic::transitions_of(&layout).remove(0);
+    let mut step = synthetic::transitions_of(&task).remove(0);
     (step.rewards_per_arm, step.advice, step.advised_arms) = (vec![-1.0], Vec::new(), 0);
     step.budget_left = None;
-    let metadata = EpisodeMetadata { layout: layout.clone(), ..synthetic::metadata() };
+    let metadata = EpisodeMetadata { task: task.clone(), ..synthetic::metadata() };
     let mut recorder = EpisodeRecorder::create(path, &metadata).unwrap();
     recorder.record_step(&scene, &synthetic::record(0, &step)).unwrap();
     scene.time_s = 2.0;
-    recorder.record_outcome(&scene, &vec![0.25; layout.n_observation()]).unwrap();
+    recorder.record_outcome(&scene, &vec![0.25; task.n_observation()]).unwrap();
     recorder.finish().unwrap()
 }
 

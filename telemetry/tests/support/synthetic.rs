@@ -21,7 +21,7 @@ pub(crate) fn metadata() -> EpisodeMetadata {
         seed: u64::MAX,
         kind: EpisodeKind::Evaluation,
         parameter_version: 3,
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         policy_digest: "5f3a".to_owned(),
         world: BTreeMap::from([("substeps".to_owned(), "20".to_owned())]),
     }
@@ -148,7 +148,7 @@ pub(crate) fn write_log(path: &Path) -> Result<PathBuf, Error> {
 
 /// Writes an episode of a task that is not built-in.
 pub(crate) fn write_described_log(path: &Path, task: &TaskSpec) -> Result<PathBuf, Error> {
-    let metadata = EpisodeMetadata { layout: task.clone(), ..metadata() };
+    let metadata = EpisodeMetadata { task: task.clone(), ..metadata() };
     let mut recorder = EpisodeRecorder::create(path, &metadata)?;
     for (step, transition) in (0..).zip(&transitions_of(task)) {
         recorder.record_step(None, &record(step, transition))?;

@@ -66,7 +66,7 @@ async fn try_play<A: Act + Send + 'static>(
 ) -> Result<Result<Vec<Episode>, RolloutError>, Failure> {
     let (mut peers, mut requests) = PeerChannel::new();
     let (finished, playing) = oneshot::channel();
-    let (order, task, terms) = (order.clone(), terms.layout.clone(), terms.clone());
+    let (order, task, terms) = (order.clone(), terms.task.clone(), terms.clone());
     let spawned = std::thread::Builder::new().name("rollout".to_owned()).spawn(move || {
         let played = play_slot(&mut peers, &order, &terms, &mut actor, &mut NoAdvisor);
         // Fails only if the evaluation was abandoned meanwhile.

@@ -23,7 +23,7 @@ fn interleaved() -> TaskSpec {
 #[test]
 fn a_teacher_sees_and_returns_numbers_in_arm_order() {
     let task = interleaved();
-    let terms = RunTerms { layout: task.clone(), ..terms() };
+    let terms = RunTerms { task: task.clone(), ..terms() };
     let mut teacher = FakeTeacher::new(|_, _, arm| arm == 1);
     let (mut env, mut actor) = (FakeEnvironment::new(), FakeActor::Constant(0.5));
     let order = slot(&[3], true);

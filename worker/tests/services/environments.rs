@@ -188,7 +188,7 @@ fn lab_push() -> TaskSpec {
 
 /// Records the evaluation of a run of [`lab_push`] and returns the log's path.
 async fn recorded_on(environments: &Arc<FakeEnvironments>, log_dir: &Path) -> PathBuf {
-    let terms = RunTerms { layout: lab_push(), account: None, ..terms() };
+    let terms = RunTerms { task: lab_push(), account: None, ..terms() };
     let learner = Arc::new(FakeLearner::new(orders().split_off(2)).with_terms(terms));
     let (learner_server, server) = (Server::learner(&learner), Server::environments(environments));
     let config = WorkerConfig {
@@ -205,7 +205,7 @@ async fn recorded_on(environments: &Arc<FakeEnvironments>, log_dir: &Path) -> Pa
     let log = read_episode(&path).expect("a whole log");
     let episode = learner.episodes().into_values().find(|episode| episode.number == 1);
     let episode = episode.expect("delivered");
-    assert_eq!((&log.metadata.layout, log.metadata.seed), (&lab_push(), 21));
+    assert_eq!((&log.metadata.task, log.metadata.seed), (&lab_push(), 21));
     for (step_idx, step) in log.transitions.iter().enumerate() {
         assert_eq!(step.observation, episode.observation(step_idx));
         assert_eq!((&step.goal, step.action.as_slice()), (&episode.goal, episode.action(step_idx)));

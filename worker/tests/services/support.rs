@@ -26,7 +26,7 @@ pub(crate) const LAYOUT: Layout = Layout::new(Task::Push, 2);
 pub(crate) fn terms() -> RunTerms {
     RunTerms {
         run: "run-7".to_owned(),
-        layout: LAYOUT.into(),
+        task: LAYOUT.into(),
         account: Some("run".to_owned()),
         advice: AdviceTerms::default(),
         exploration: Exploration {

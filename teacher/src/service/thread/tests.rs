@@ -331,8 +331,8 @@ struct SlowPolicy {
 }
 
 impl TeacherPolicy for SlowPolicy {
-    fn layout(&self) -> TaskSpec {
-        FakePolicy.layout()
+    fn task(&self) -> TaskSpec {
+        FakePolicy.task()
     }
 
     fn digest(&self) -> &str {

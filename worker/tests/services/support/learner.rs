@@ -225,7 +225,7 @@ impl pb::learner_server::Learner for FakeLearner {
                 }
             }
             for message in request.episodes {
-                let episode = tandem_proto::decode_episode(message, &self.terms.layout)?;
+                let episode = tandem_proto::decode_episode(message, &self.terms.task)?;
                 let key = (episode.kind == EpisodeKind::Evaluation, episode.number);
                 assert!(state.episodes.insert(key, episode).is_none(), "delivered twice: {key:?}");
             }
