@@ -42,7 +42,7 @@ fn add_queue(registry: &mut Registry, queue: &WorkQueue, now: Duration) {
     let (waiting, playing) = (queue.n_waiting() as f64, queue.n_assigned() as f64);
     gauge(registry, "assignments_waiting", "Slots that wait for a worker", waiting);
     gauge(registry, "assignments_playing", "Slots that a worker plays", playing);
-    gauge(registry, "workers", "Workers that call", queue.n_alive(now) as f64);
+    gauge(registry, "workers", "Workers that have called lately", queue.n_alive(now) as f64);
 }
 
 /// Adds the counters and rates of the run.
@@ -57,7 +57,7 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
     gauge(
         registry,
         "needs_attention",
-        "1 while something requires an operator, see Status",
+        "1 while the run has a warning; tandem status prints it",
         needs_attention,
     );
     if progress.phase.is_none() {
@@ -75,8 +75,8 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
     gauge(registry, "advice_left", "Units of advice that are left", left);
     gauge(registry, "wall_seconds", "Seconds of the run, resumed parts added up", progress.wall_s);
     let (steps_per_s, updates_per_s) = (progress.env_steps_per_s, progress.updates_per_s);
-    gauge(registry, "env_steps_per_second", "Training steps a second, of late", steps_per_s);
-    gauge(registry, "updates_per_second", "Updates a second, of late", updates_per_s);
+    gauge(registry, "env_steps_per_second", "Recent environment steps of training per second", steps_per_s);
+    gauge(registry, "updates_per_second", "Recent updates per second", updates_per_s);
 }
 
 /// Returns one of the counters.

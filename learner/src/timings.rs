@@ -20,7 +20,7 @@ impl Timings {
     /// Registers the metrics.
     pub(crate) fn register(metrics: &Metrics) -> Self {
         let histogram = |name, help, buckets: &[f64]| metrics.histogram(name, help, buckets);
-        let round = "Time of a round, from waiting for its episodes to the order of the next";
+        let round = "Time from the start of the wait for a round's episodes until the next round is ordered";
         let collect = "Time for which a round waited for its episodes";
         let update = "Time of one update of the networks";
         let checkpoint = "Time in which a checkpoint was written";

@@ -48,7 +48,7 @@ pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: e
      than 5 evaluations. An epoch is `rounds.per_epoch` rounds, 50 by default.";
 
 /// Heads of columns that a table of few contacts lacks.
-const WITHOUT_ARM_CONTACT: &str = "without arm contact";
+const WITHOUT_CONTACT: &str = "without contact";
 const CONTACTS: &str = "contacts";
 
 /// The runs of one task and number of arms.
@@ -248,7 +248,7 @@ impl Section {
             self.label_head(),
             "env steps",
             "test goals",
-            WITHOUT_ARM_CONTACT,
+            WITHOUT_CONTACT,
             "best policy",
             "last evaluation",
             "joint goal",
@@ -272,7 +272,7 @@ impl Section {
         let baselines = self.baselines.iter();
         table.rows.extend(baselines.map(|baseline| baseline_row(baseline, reports_contacts)));
         if !self.may_have_arm_contact() {
-            table.remove_column(WITHOUT_ARM_CONTACT);
+            table.remove_column(WITHOUT_CONTACT);
         }
         if !reports_contacts {
             table.remove_column(CONTACTS);

@@ -144,14 +144,14 @@ fn the_page_of_one_arm_without_advice_has_nothing_about_either() {
     let dir = run_dir(&[alone(0, 0), alone(5, 60)]);
     std::fs::write(dir.path().join("run.toml"), "task = \"push\"\narms = 1\n").unwrap();
     let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
-    for text in ["without arm contact", "Advice spent", "<span>advice spent"] {
+    for text in ["without contact", "Advice spent", "<span>advice spent"] {
         assert!(!page.contains(text), "{text}");
     }
     assert!(page.contains("tabindex=0 role=region aria-label=\"Evaluations\""));
     std::fs::write(dir.path().join("run.toml"), "task = \"push\"\narms = 2\n").unwrap();
     let page = std::fs::read_to_string(run_report_html(dir.path(), &[]).unwrap()).unwrap();
     assert_eq!(
-        page.matches("without arm contact").count(),
+        page.matches("without contact").count(),
         4,
         "a tile, a column, and the legend in two sizes"
     );

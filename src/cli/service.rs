@@ -105,7 +105,7 @@ pub(crate) struct TeacherArgs {
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  tandem learner --run runs/mine/run.toml --listen 0.0.0.0:7000 \\
+  tandem learner --run runs/mine/run.toml --listen 127.0.0.1:7000 \\
       --teacher 127.0.0.1:7001 --out runs/mine
   tandem learner --run runs/mine/run.toml --out runs/mine --resume \\
       --teacher 127.0.0.1:7001

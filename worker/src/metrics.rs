@@ -32,7 +32,7 @@ impl WorkerMetrics {
         let slot = "Time in which a slot was played";
         let step = "Time in which all environments of a slot execute one step";
         let advice = "Time for which a rollout waits for advice on one step";
-        let version = "Version of the parameters that play";
+        let version = "Version of the parameters in use";
         Self {
             wait_seconds: histogram("worker_wait_seconds", wait, &DURATION_BUCKETS_S),
             slot_seconds: histogram("worker_slot_seconds", slot, &DURATION_BUCKETS_S),

@@ -17,9 +17,9 @@ const CONTACT_TILE: &str = "with contact";
 /// The tile of a run that took advice.
 const ADVICE_TILE: &str = "advice spent";
 /// The column of a task with several arms.
-const WITHOUT_ARM_CONTACT: &str = "without arm contact";
+const WITHOUT_CONTACT: &str = "without contact";
 /// The tile of a task with several arms.
-const WITHOUT_ARM_CONTACT_TILE: &str = "success without arm contact";
+const WITHOUT_CONTACT_TILE: &str = "success without contact";
 
 /// Returns key values, curves, evaluations and configuration of `run` as HTML.
 pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
@@ -33,7 +33,7 @@ pub(super) fn body(run: &Run, films: &[FilmStrip]) -> Result<String, Error> {
             let is_shown = |label: &str| match label {
                 CONTACT_TILE => reports_contacts(task.as_ref()),
                 ADVICE_TILE => run.took_advice(),
-                WITHOUT_ARM_CONTACT_TILE => has_several_arms(task.as_ref()),
+                WITHOUT_CONTACT_TILE => has_several_arms(task.as_ref()),
                 _ => true,
             };
             body.push_str(&tiles(best, last, is_shown));
@@ -108,7 +108,7 @@ fn tiles(best: &MetricsRow, last: &MetricsRow, is_shown: impl Fn(&str) -> bool) 
         let arm_contact = optional(best.contacts.arm_contact_rate, share);
         let table_contact = optional(best.contacts.table_contact_rate, share);
         (
-            WITHOUT_ARM_CONTACT_TILE,
+            WITHOUT_CONTACT_TILE,
             share(success),
             format!(
                 "95 % interval {}; contact between arms: {arm_contact}, with table: {table_contact}",
@@ -180,7 +180,7 @@ fn curves(run: &Run, task: Option<&TaskSpec>) -> Result<Vec<Drawing>, Error> {
     ];
     let is_known = |row: &MetricsRow| row.contacts.success_without_contact.is_some();
     if has_several_arms(task) && run.rows.iter().any(is_known) {
-        shares.insert(1, (WITHOUT_ARM_CONTACT, Quantity::SuccessWithoutContact));
+        shares.insert(1, (WITHOUT_CONTACT, Quantity::SuccessWithoutContact));
     }
     let success = series(&shares);
     let contacts = series(&[
@@ -209,7 +209,7 @@ const EVALUATION_HEADER: [&str; 13] = [
     "time",
     "success",
     "95 % interval",
-    WITHOUT_ARM_CONTACT,
+    WITHOUT_CONTACT,
     "joint",
     "contact",
     "moved",
@@ -220,7 +220,7 @@ const EVALUATION_HEADER: [&str; 13] = [
 /// Returns the table of all evaluations.
 fn evaluations(rows: &[MetricsRow], task: Option<&TaskSpec>) -> String {
     let is_shown =
-        |idx: &usize| has_several_arms(task) || EVALUATION_HEADER[*idx] != WITHOUT_ARM_CONTACT;
+        |idx: &usize| has_several_arms(task) || EVALUATION_HEADER[*idx] != WITHOUT_CONTACT;
     let columns: Vec<usize> = (0..EVALUATION_HEADER.len()).filter(is_shown).collect();
     let header: Vec<&str> = columns.iter().map(|idx| EVALUATION_HEADER[*idx]).collect();
     let cells = |row| {
