@@ -111,6 +111,14 @@ pub(crate) enum Command {
     Picture(PictureArgs),
     /// Prints the simulated world, and episodes in it, as JSON for other physics engines.
     Scene(SceneArgs),
+    /// Prints the help of every command as a Markdown page.
+    #[command(
+        hide = true,
+        after_help = "\
+Examples:
+  tandem commands > commands.md"
+    )]
+    Commands,
 }
 
 #[cfg(test)]

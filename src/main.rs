@@ -14,6 +14,7 @@ mod call_failure;
 mod cli;
 mod clock;
 mod columns;
+mod commands_page;
 mod dashboard;
 mod environment_command;
 mod environment_file;
@@ -109,6 +110,7 @@ fn dispatch(command: Command) -> Result<(), Failed> {
         Command::Replay(args) => replay::replay(&args),
         Command::Picture(args) => picture::picture(&args),
         Command::Scene(args) => scene::scene(&args),
+        Command::Commands => commands_page::print(),
     }
 }
 

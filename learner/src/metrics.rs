@@ -75,7 +75,12 @@ fn add_progress(registry: &mut Registry, progress: &Progress) {
     gauge(registry, "advice_left", "Units of advice that are left", left);
     gauge(registry, "wall_seconds", "Seconds of the run, resumed parts added up", progress.wall_s);
     let (steps_per_s, updates_per_s) = (progress.env_steps_per_s, progress.updates_per_s);
-    gauge(registry, "env_steps_per_second", "Recent environment steps of training per second", steps_per_s);
+    gauge(
+        registry,
+        "env_steps_per_second",
+        "Recent environment steps of training per second",
+        steps_per_s,
+    );
     gauge(registry, "updates_per_second", "Recent updates per second", updates_per_s);
 }
 
