@@ -43,14 +43,52 @@ pub(crate) fn report(args: &ReportArgs) -> Result<(), Failed> {
     warn(comparison.warnings.iter());
     comparison.films = films(args)?;
     let plotted = if args.all_trials { PlottedTrials::All } else { PlottedTrials::Failed };
-    let files = report_html(&comparison, &trials, plotted, &page)
-        .or_cannot_write(|| "the page is not written, choose another --out".to_owned());
-    let written = write(args.csv.as_deref(), || export::csv(&comparison))
-        .and_then(|()| write(args.markdown.as_deref(), || comparison.markdown()));
+    let (written, failures) = Written::of(args, &comparison, (&trials, plotted), &page);
     // Also if a file could not be written, as in a directory that cannot be changed.
-    print(args, &comparison, &trials, files.as_ref().ok())?;
-    files?;
-    written
+    let printed = print(args, &comparison, &trials, &written);
+    let mut failures = printed.err().into_iter().chain(failures);
+    let first = failures.next();
+    failures.for_each(|failed| output::message(format_args!("tandem: {}", failed.line())));
+    first.map_or(Ok(()), Err)
+}
+
+/// The files that a report has written.
+#[derive(Default)]
+struct Written<'a> {
+    page: Option<ReportFiles>,
+    /// Files with tables, each after its format.
+    tables: Vec<(&'static str, &'a Path)>,
+}
+
+impl<'a> Written<'a> {
+    /// Writes each file that the command line names, whether or not the others can be written, and returns the failures
+    /// as well.
+    fn of(
+        args: &'a ReportArgs,
+        comparison: &Comparison,
+        (trials, plotted): (&Trials, PlottedTrials),
+        page: &Path,
+    ) -> (Self, Vec<Failed>) {
+        let (mut written, mut failures) = (Self::default(), Vec::new());
+        let files = report_html(comparison, trials, plotted, page)
+            .or_cannot_write(|| "the page is not written, choose another --out".to_owned());
+        match files {
+            Ok(files) => written.page = Some(files),
+            Err(failed) => failures.push(failed),
+        }
+        let tables: [(_, _, &dyn Fn() -> String); 2] = [
+            ("csv", &args.csv, &|| export::csv(comparison)),
+            ("markdown", &args.markdown, &|| comparison.markdown()),
+        ];
+        for (format, path, text) in tables {
+            let Some(path) = path else { continue };
+            match write(path, &text()) {
+                Ok(()) => written.tables.push((format, path)),
+                Err(failed) => failures.push(failed),
+            }
+        }
+        (written, failures)
+    }
 }
 
 /// Returns the files that the report writes, with the names of their options.
@@ -74,13 +112,18 @@ fn check_outputs(args: &ReportArgs, page: &Path) -> Result<(), Failed> {
     }
     let outputs = outputs(args, page);
     output::check_distinct(&outputs)?;
-    let evals = args.evals.iter().map(|path| ("--eval", path));
+    for path in &args.evals {
+        output::check_keeps(&outputs, ("--eval", path))?;
+    }
     let teachers = args.composed_teachers.iter().map(|path| ("--composed-teachers", path));
     let filmed = args.film_strips.iter().map(|path| ("--film-strips", path));
-    evals
-        .chain(teachers)
-        .chain(filmed)
-        .try_for_each(|(name, input)| output::check_keeps(&outputs, (name, input)))
+    for (name, path) in teachers.chain(filmed) {
+        // A policy that is missing is reported when it is read.
+        if let Ok(file) = policy_file::file_of(path) {
+            output::check_keeps(&outputs, (name, &file))?;
+        }
+    }
+    Ok(())
 }
 
 /// Rejects outputs that would replace a file of a run or of trials.
@@ -88,7 +131,7 @@ fn check_no_input(outputs: &[(&str, Option<&Path>)], inputs: &ReportInputs) -> R
     let named = outputs.iter().filter_map(|(name, path)| Some((name, (*path)?)));
     match named.into_iter().find(|(_, path)| inputs.contains(path)) {
         Some((name, path)) => Err(Failed::usage(format!(
-            "{name} {}: the report reads this file; choose another",
+            "{name} {}: it is a file of a run or of trials that the report reads; choose another",
             path.display()
         ))),
         None => Ok(()),
@@ -96,20 +139,19 @@ fn check_no_input(outputs: &[(&str, Option<&Path>)], inputs: &ReportInputs) -> R
 }
 
 /// Writes `text` to a file that the command line names.
-fn write(path: Option<&Path>, text: impl FnOnce() -> String) -> Result<(), Failed> {
-    path.map_or(Ok(()), |path| {
-        let written = atomic_file::replace_target(path, text().as_bytes());
-        written.or_cannot_write(|| format!("cannot write {}", path.display()))
-    })
+fn write(path: &Path, text: &str) -> Result<(), Failed> {
+    let written = atomic_file::replace_target(path, text.as_bytes());
+    written.or_cannot_write(|| format!("cannot write {}", path.display()))
 }
 
 fn print(
     args: &ReportArgs,
     comparison: &Comparison,
     trials: &Trials,
-    files: Option<&ReportFiles>,
+    written: &Written<'_>,
 ) -> Result<(), Failed> {
     if args.json {
+        let files = written.page.as_ref();
         let mut value = export::json(comparison);
         value["trials"] = trials::json(trials);
         value["report"] = json!(files.map(|files| files.page.to_string_lossy()));
@@ -127,16 +169,20 @@ fn print(
         output::print(comparison.text())?;
         output::print(comparison.notes())?;
     }
-    let Some(files) = files else { return Ok(()) };
-    output::print(format_args!("report        {}", files.page.display()))?;
-    if let Some(directory) = files.plots.first().and_then(|figure| figure.parent()) {
-        let n_figures = counted(files.plots.len(), "file");
-        output::print(format_args!("figures       {}: {n_figures}", directory.display()))?;
-    }
-    for (label, path) in [("csv", &args.csv), ("markdown", &args.markdown)] {
-        if let Some(path) = path {
-            output::print(format_args!("{label:<13} {}", path.display()))?;
+    print_written(written)
+}
+
+/// Prints the paths of the files that were written.
+fn print_written(written: &Written<'_>) -> Result<(), Failed> {
+    if let Some(files) = &written.page {
+        output::print(format_args!("report        {}", files.page.display()))?;
+        if let Some(directory) = files.plots.first().and_then(|figure| figure.parent()) {
+            let n_figures = counted(files.plots.len(), "file");
+            output::print(format_args!("figures       {}: {n_figures}", directory.display()))?;
         }
+    }
+    for (format, path) in &written.tables {
+        output::print(format_args!("{format:<13} {}", path.display()))?;
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use tandem_core::text::counted;
-use tandem_net::AuthChannel;
+use tandem_net::{AuthChannel, ClientConfig};
 use tandem_proto::pb;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tonic::{Code, Response, Status};
@@ -40,16 +40,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
     };
     let runtime = runtime::new().or_exit(Exit::TryAgain, String::new)?;
     runtime.block_on(async {
-        let no_directory = || format!("there is no directory {}", args.run.display());
-        let link = client_config.channel(&address).or_exit(Exit::Usage, no_directory)?;
-        let mut learner = Learner {
-            client: LearnerClient::new(link),
-            advice: match args.run.is_dir() {
-                true => STARTING_OR_ENDING,
-                false => "`tandem status DIR` shows a `tandem train` by its run directory",
-            },
-            address,
-        };
+        let mut learner = Learner::at(address, client_config, &args.run)?;
         if args.watch {
             watch::watch(&mut learner, args).await
         } else {
@@ -61,9 +52,41 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Failed> {
 /// The learner of a run.
 struct Learner {
     client: LearnerClient<AuthChannel>,
+    client_config: ClientConfig,
     address: String,
     /// The advice if nothing listens at the address.
     advice: &'static str,
+}
+
+impl Learner {
+    /// Returns the learner at `address`, whose run the command line names as `run`.
+    fn at(address: String, client_config: ClientConfig, run: &Path) -> Result<Self, Failed> {
+        let no_directory = || format!("there is no directory {}", run.display());
+        let link = client_config.channel(&address).or_exit(Exit::Usage, no_directory)?;
+        let advice = match run.is_dir() {
+            true => STARTING_OR_ENDING,
+            false => "`tandem status DIR` shows a `tandem train` by its run directory",
+        };
+        Ok(Self { client: LearnerClient::new(link), client_config, address, advice })
+    }
+
+    /// Takes over the address in the run directory `run`: that of another learner if a new `tandem train` uses the
+    /// directory, and missing while that is starting.
+    fn update_address(&mut self, run: &Path) -> Result<(), Failed> {
+        match address_in(run) {
+            Some(address) if address != self.address => {
+                *self = Self::at(address, self.client_config.clone(), run)?;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// Returns the address of the learner that `tandem train` has started for the run in `dir`.
+fn address_in(dir: &Path) -> Option<String> {
+    let address = std::fs::read_to_string(run_directory::learner_address(dir)).ok()?;
+    Some(address.trim().to_owned())
 }
 
 /// The source of a progress report.
@@ -91,13 +114,10 @@ fn source_of(run: &Path) -> Result<Source, Failed> {
     if run_directory::lock(run)?.is_some() {
         return Ok(Source::Recorded);
     }
-    match std::fs::read_to_string(run_directory::learner_address(run)) {
-        Ok(address) => Ok(Source::Learner(address.trim().to_owned())),
-        Err(_missing) => Err(Failed::new(
-            Exit::TryAgain,
-            anyhow!("a process uses {}: {STARTING_OR_ENDING}", run.display()),
-        )),
-    }
+    address_in(run).map(Source::Learner).ok_or_else(|| {
+        let what = anyhow!("a process uses {}: {STARTING_OR_ENDING}", run.display());
+        Failed::new(Exit::TryAgain, what)
+    })
 }
 
 /// Prints the current progress.
@@ -161,6 +181,21 @@ fn lines(progress: &pb::Progress) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn a_run_directory_leads_to_the_learner_of_its_latest_start() {
+        let run = tempfile::tempdir().expect("a directory");
+        let address = || "127.0.0.1:1".to_owned();
+        let mut learner =
+            Learner::at(address(), ClientConfig::default(), run.path()).expect("an address");
+        learner.update_address(run.path()).expect("none is written");
+        assert_eq!(learner.address, address());
+        std::fs::create_dir(run_directory::in_use(run.path())).expect("creates");
+        std::fs::write(run_directory::learner_address(run.path()), "127.0.0.1:2\n")
+            .expect("writes");
+        learner.update_address(run.path()).expect("an address");
+        assert_eq!(learner.address, "127.0.0.1:2");
+    }
 
     #[test]
     fn silent_workers_and_a_warning_are_shown() {

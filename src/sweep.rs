@@ -5,6 +5,7 @@
 
 mod board;
 mod display;
+mod result;
 mod run_process;
 mod run_status;
 mod sweep_file;
@@ -33,8 +34,9 @@ use crate::shell::shell_word;
 use crate::{dashboard, output, runtime, signals};
 use board::Board;
 use display::Display;
+use result::{Unfinished, print_result};
 use run_process::{RunOutcome, RunProcess};
-use run_status::{RunStatus, State};
+use run_status::{LENGTH, RunStatus, State};
 use sweep_file::{PlannedRun, PlannedSweep};
 
 /// Time between two updates of the live lines and of the dashboard.
@@ -100,7 +102,7 @@ pub(crate) fn sweep(args: &SweepArgs) -> Result<(), Failed> {
     }
     print_result(&statuses, &out, args.json)
         .map_err(|failed| failed.context(format!("the runs have ended, see {}", out.display())))?;
-    failures(&statuses)
+    Unfinished::of(&statuses).check()
 }
 
 /// Returns `runs/NAME`, after the sweep file.
@@ -150,8 +152,12 @@ fn refuse(refused: &[String], out: &Path) -> Result<(), Failed> {
         0 => String::new(),
         n => format!("; and {n} more"),
     };
+    let length = match named.contains(LENGTH) {
+        true => format!(" (a larger {LENGTH} extends runs)"),
+        false => String::new(),
+    };
     Err(Failed::usage(format!(
-        "{named}{more}: choose another --out than {}, or undo the change (a larger stop.max_env_steps extends runs)",
+        "{named}{more}: choose another --out than {}, or undo the change{length}",
         out.display()
     )))
 }
@@ -202,7 +208,7 @@ impl<'a> Sweep<'a> {
         }
         let n_extended = statuses.iter().filter(|status| status.extends_to.is_some()).count();
         if n_extended > 0 {
-            display.print(&format!("{} to a larger stop.max_env_steps", extends(n_extended)));
+            display.print(&format!("{} to a larger {LENGTH}", extends(n_extended)));
         }
         let lines = mpsc::channel(statuses.len().max(1));
         let board = None;
@@ -272,10 +278,8 @@ impl<'a> Sweep<'a> {
         if interrupted.is_cancelled() {
             return self.save(running).await;
         }
-        match self.statuses.iter().filter(|status| status.failure.is_some()).count() {
-            0 => self.end("complete"),
-            n_failed => self.end(&format!("{n_failed} of {} runs failed", self.statuses.len())),
-        }
+        let end = Unfinished::of(self.statuses).summary();
+        self.end(&end);
         Ok(SweepEnd::Complete)
     }
 
@@ -360,7 +364,7 @@ impl<'a> Sweep<'a> {
             RunOutcome::InUse => {
                 let why = format!("another process still uses {}", status.dir.display());
                 self.display.ended(&name, &format!("left out: {why}"));
-                status.skip(why);
+                status.leave_out(why);
             }
             RunOutcome::Interrupted => self.display.print(&format!("{name}: interrupted")),
         }
@@ -413,50 +417,6 @@ fn classic_note(statuses: &[RunStatus]) -> Option<&'static str> {
     )
 }
 
-fn print_result(statuses: &[RunStatus], out: &Path, as_json: bool) -> Result<(), Failed> {
-    let n_finished = statuses.iter().filter(|one| matches!(one.state, State::Finished(_))).count();
-    if as_json {
-        let runs: Vec<Value> = statuses
-            .iter()
-            .map(|status| {
-                let summary = match &status.state {
-                    State::Finished(summary) => summary.clone(),
-                    State::New | State::Started => Value::Null,
-                };
-                json!({"name": status.run.name, "summary": summary, "failure": status.failure})
-            })
-            .collect();
-        return output::print(
-            json!({"out": out.to_string_lossy(), "finished": n_finished, "runs": runs}),
-        );
-    }
-    output::print(format_args!(
-        "finished      {n_finished} of {} runs in {}",
-        statuses.len(),
-        out.display()
-    ))?;
-    output::print(format_args!("compare them  tandem report {}", shell_word(out)))
-}
-
-/// Returns an error that names the failed runs, if there are any.
-fn failures(statuses: &[RunStatus]) -> Result<(), Failed> {
-    let failed: Vec<&str> = statuses
-        .iter()
-        .filter(|status| status.failure.is_some())
-        .map(|status| status.run.name.as_str())
-        .collect();
-    if failed.is_empty() {
-        return Ok(());
-    }
-    let error = anyhow!(
-        "{} of {} runs failed and are retried at the next start: {}; see sweep.log in their directories",
-        failed.len(),
-        statuses.len(),
-        failed.join(", ")
-    );
-    Err(Failed::new(Exit::TryAgain, error))
-}
-
 fn print_resume_command(args: &SweepArgs, out: &Path, end: SweepEnd) {
     let options = match args.only {
         Some(only) => format!(" --only {only}"),
@@ -482,6 +442,18 @@ mod tests {
     use std::io::{Read as _, Write as _};
 
     use super::*;
+
+    #[test]
+    fn only_a_run_of_another_length_is_refused_with_what_extends_it() {
+        let refused = |difference: &str| {
+            let run = format!("a was made with other settings: {difference}");
+            refuse(&[run], Path::new("runs/s")).expect_err("another run").line()
+        };
+        let shorter = refused("stop.max_env_steps is 800 there, 400 now");
+        assert!(shorter.ends_with("undo the change (a larger stop.max_env_steps extends runs)"));
+        let other_teacher = refused("its teacher is another one");
+        assert!(other_teacher.ends_with("than runs/s, or undo the change"), "{other_teacher}");
+    }
 
     #[test]
     fn the_lock_file_is_open_for_reading_and_for_writing() {

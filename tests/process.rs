@@ -404,6 +404,9 @@ fn a_watcher_follows_a_run_across_restarts_and_reports_its_interruption() {
     kill_one(&run, "learner");
     assert!(eventually(is_shown), "the restarted learner: {:?}", status(&out));
     assert!(watcher.try_wait().expect("a child").is_none(), "the watcher waits for the restart");
+    let mut further = std::iter::from_fn(|| first.recv_timeout(Duration::from_mins(2)).ok());
+    let is_restart = |line: String| line.starts_with("the learner continues from round ");
+    assert!(further.any(is_restart), "the restart is printed");
     signal("-INT", run.id());
     assert_eq!(finish(run).status.code(), Some(130));
     let watched = finish(watcher);

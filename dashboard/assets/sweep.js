@@ -26,7 +26,7 @@ const live = (idx) => state?.live.find((each) => each.run === idx);
 const counted = (wanted) => runs.filter((run) => run.state === wanted).length;
 
 function tiles(s) {
-  const names = { running: "Running", waiting: "Waiting", failed: "Failed", saved: "Saved" };
+  const names = { running: "Running", waiting: "Waiting", failed: "Failed", saved: "Saved", "left out": "Left out" };
   const further = Object.entries(names).filter(([name]) => counted(name) > 0 || name === "running");
   return [
     ["Finished", count(counted("finished")), `of ${plural(s.n_runs, "run")}`],
@@ -35,8 +35,12 @@ function tiles(s) {
   ];
 }
 
-/** The colours of the ends of a sweep; further ones are failures. */
+/** The colours of the ends of a sweep without failures; further ones count runs that were left out. */
 const ENDS = { complete: "good", interrupted: "warning" };
+
+function levelOfEnd(end) {
+  return end.includes("failed") ? "bad" : ENDS[end] ?? "warning";
+}
 
 function showHeader(s) {
   setText(byId("name"), s.name || "Sweep");
@@ -44,7 +48,7 @@ function showHeader(s) {
   setText(byId("terms"), `${plural(s.n_runs, "run")} in ${s.directory}`);
   const phase = byId("phase");
   setText(phase, s.end || "running");
-  phase.className = `badge ${s.end ? ENDS[s.end] ?? "bad" : ""}`;
+  phase.className = `badge ${s.end ? levelOfEnd(s.end) : ""}`;
   setText(byId("clock"), `${clock(s.wall_s)} since its start`);
   const isLimited = s.max_env_steps > 0;
   const done = isLimited ? Math.min(1, s.env_steps / s.max_env_steps) : counted("finished") / Math.max(1, s.n_runs);
@@ -57,7 +61,7 @@ function showHeader(s) {
     : `${count(counted("finished"))} of ${plural(s.n_runs, "run")} finished`);
 }
 
-const BADGES = { finished: "good", failed: "bad", saved: "warning" };
+const BADGES = { finished: "good", failed: "bad", saved: "warning", "left out": "warning" };
 
 function showRuns() {
   keyed(byId("run-list"), runs.map((run, idx) => ({ run, idx })), ({ idx }) => idx,

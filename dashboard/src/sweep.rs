@@ -45,7 +45,7 @@ pub struct SweepRunView {
     pub seed: u64,
     /// The state: waiting, running or ended.
     pub state: SweepRunState,
-    /// The reason why the latest attempt failed, or an empty text.
+    /// The reason why the latest attempt failed or the run was left out, or an empty text.
     pub failure: String,
     /// Success of its best policy on test goals, once it is finished.
     pub result: Option<SweepResult>,
@@ -96,6 +96,9 @@ pub enum SweepRunState {
     Failed,
     /// The run was interrupted and is saved.
     Saved,
+    /// The sweep did not train the run, which another process uses.
+    #[serde(rename = "left out")]
+    LeftOut,
 }
 
 /// Success on test goals, with its 95 % interval.
@@ -300,8 +303,12 @@ fn news(former: Option<&SweepView>, view: &SweepView) -> Vec<(Level, String)> {
         }
     }
     if former.end != view.end && !view.end.is_empty() {
-        let has_failed = view.runs.iter().any(|run| run.state == SweepRunState::Failed);
-        let level = if has_failed { Level::Bad } else { Level::Info };
+        let has_any = |state| view.runs.iter().any(|run| run.state == state);
+        let level = match (has_any(SweepRunState::Failed), has_any(SweepRunState::LeftOut)) {
+            (true, _) => Level::Bad,
+            (false, true) => Level::Warning,
+            (false, false) => Level::Info,
+        };
         news.push((level, format!("The sweep has ended: {}", view.end)));
     }
     news
@@ -321,6 +328,7 @@ fn change(run: &SweepRunView) -> Option<(Level, String)> {
         }
         SweepRunState::Failed => (Level::Bad, format!("{name} failed: {}", run.failure)),
         SweepRunState::Saved => (Level::Warning, format!("{name} is saved")),
+        SweepRunState::LeftOut => (Level::Warning, format!("{name} is left out: {}", run.failure)),
     })
 }
 
@@ -380,6 +388,7 @@ mod tests {
             SweepRunState::Running,
             SweepRunState::Failed,
             SweepRunState::Saved,
+            SweepRunState::LeftOut,
         ] {
             check(SweepRunView { env_steps: 500, ..run("b", state) }, (820, 1320));
         }
@@ -410,6 +419,16 @@ mod tests {
         assert_eq!(
             log.as_array().and_then(|log| log.last()).map(|it| &it["text"]),
             Some(&"a failed: no disk".into())
+        );
+        view.runs[0].state = SweepRunState::LeftOut;
+        "in use".clone_into(&mut view.runs[0].failure);
+        let frame = feed.frame(&view);
+        assert_eq!(json(frame.documents["runs"].text())[0]["state"], "left out");
+        let log = json(frame.documents["log"].text());
+        let last = log.as_array().and_then(|log| log.last()).expect("an event");
+        assert_eq!(
+            (&last["level"], &last["text"]),
+            (&"warning".into(), &"a is left out: in use".into())
         );
     }
 }

@@ -13,6 +13,8 @@ use crate::run_summary;
 
 /// The files of a run directory that are read.
 const RUN_FILES: [&str; 3] = ["metrics.jsonl", "run.toml", run_summary::FILE];
+/// The directories in a run directory with the run's policies, among them the copy of its teacher, and its checkpoints.
+const RUN_DIRECTORIES: [&str; 2] = ["policy", "checkpoint"];
 /// Depth to which directories are searched.
 const MAX_DEPTH: usize = 6;
 
@@ -61,13 +63,18 @@ impl ReportInputs {
         is_new
     }
 
-    /// Returns true if `path` is one of the files that were read: writing it would destroy an input.
+    /// Returns true if `path` is one of the files that were read, or is in the directory of the policies or of the
+    /// checkpoints of a run that was read: writing it would destroy an input or change a run.
     #[must_use]
     pub fn contains(&self, path: &Path) -> bool {
-        let Ok(path) = path.canonicalize() else { return false };
-        let is_of_run = path.parent().is_some_and(|parent| self.read.contains(parent));
-        let has_name = |name: &&str| path.file_name().is_some_and(|own| own == *name);
-        self.read.contains(&path) || (is_of_run && RUN_FILES.iter().any(has_name))
+        let Some(path) = resolved(path) else { return false };
+        let is_in_run = |path: &Path, names: &[&str]| {
+            let is_of_run = path.parent().is_some_and(|parent| self.read.contains(parent));
+            is_of_run && names.iter().any(|name| path.file_name().is_some_and(|own| own == *name))
+        };
+        self.read.contains(&path)
+            || is_in_run(&path, &RUN_FILES)
+            || path.ancestors().skip(1).any(|directory| is_in_run(directory, &RUN_DIRECTORIES))
     }
 
     fn read_file(&mut self, path: &Path) -> Result<(), Error> {
@@ -114,6 +121,15 @@ impl ReportInputs {
         let n_read = self.runs.len() + self.trials.len() - n_before;
         first_error.filter(|_| n_read == 0).map_or(Ok(()), Err)
     }
+}
+
+/// Returns the path without links and `..`; that of a new file if its directory exists.
+fn resolved(path: &Path) -> Option<PathBuf> {
+    path.canonicalize().ok().or_else(|| {
+        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new(".")).canonicalize().ok()?;
+        Some(parent.join(path.file_name()?))
+    })
 }
 
 /// Paths of runs and trials in a directory.
@@ -271,12 +287,23 @@ mod tests {
         write(&path("a/metrics.jsonl"), &line(1));
         write(&path("a/run.toml"), "");
         write(&path("a/report.html"), "");
+        write(&path("a/policy/best.safetensors"), "");
+        write(&path("a/checkpoint/round/state"), "");
         write(&path("b/trials.jsonl"), &trial(1));
         let inputs = ReportInputs::load(&[dir.path().to_owned()]).unwrap();
-        for name in ["a/metrics.jsonl", "a/run.toml", "a/../a/run.toml", "b/trials.jsonl"] {
+        for name in [
+            "a/metrics.jsonl",
+            "a/run.toml",
+            "a/../a/run.toml",
+            "a/summary.json",
+            "a/policy/best.safetensors",
+            "a/policy/teacher.toml",
+            "a/checkpoint/round/state",
+            "b/trials.jsonl",
+        ] {
             assert!(inputs.contains(&path(name)), "{name}");
         }
-        for name in ["a/report.html", "a/runs.csv", "run.toml"] {
+        for name in ["a/report.html", "a/runs.csv", "a/policy", "b/policy.csv", "run.toml"] {
             assert!(!inputs.contains(&path(name)), "{name}");
         }
     }

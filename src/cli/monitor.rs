@@ -55,7 +55,7 @@ pub(crate) struct StatusArgs {
     /// each evaluation and each warning, and one every half minute.
     #[arg(long)]
     pub(crate) watch: bool,
-    /// Prints one JSON object; with --watch, one per message.
+    /// Prints one JSON object; with --watch, one per message, that of a learner's failure included.
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

@@ -158,8 +158,8 @@ Examples:
   tandem sweep deploy/sweep-small.toml --only 3   # trains one of them
   tandem sweep FILE.toml --dashboard 0.0.0.0:8600 --dashboard-token-file token
 
-docs/sweep.md describes the file. The exit code is 75 if runs failed; the next start tries each of \
-them once more.")]
+docs/sweep.md describes the file. The exit code is 75 if runs failed, or were left out because another \
+process uses them; the next start tries each of them once more.")]
 pub(crate) struct SweepArgs {
     /// Sweep file (TOML): settings of all runs, and lists of values to combine.
     #[arg(value_name = "FILE.toml")]

@@ -58,9 +58,10 @@ impl Board {
         *run = SweepRunView { dashboard, ..run_view(status) };
         run.env_steps = run.env_steps.max(steps);
         if run.state == SweepRunState::Waiting {
-            run.state = match run.failure.is_empty() {
-                true => SweepRunState::Saved,
-                false => SweepRunState::Failed,
+            run.state = match (&status.failure, &status.left_out) {
+                (Some(_), _) => SweepRunState::Failed,
+                (None, Some(_)) => SweepRunState::LeftOut,
+                (None, None) => SweepRunState::Saved,
             };
         }
         self.send();
@@ -98,12 +99,13 @@ fn run_view(status: &RunStatus) -> SweepRunView {
     let task = config.task.replace('/', "-");
     let group = group.strip_prefix(&format!("{task}-")).unwrap_or(group);
     let evaluations = rows(&status.dir);
+    let failure = status.failure.as_ref().or(status.left_out.as_ref());
     let mut view = SweepRunView {
         name: name.clone(),
         task: config.task.clone(),
         group: group.to_owned(),
         seed: config.seed,
-        failure: status.failure.clone().unwrap_or_default(),
+        failure: failure.cloned().unwrap_or_default(),
         max_env_steps: config.stop.max_env_steps,
         env_steps: evaluations.last().map_or(0, |row| row.env_steps),
         evaluations,
@@ -163,7 +165,8 @@ mod tests {
         let mut config = RunConfig::defaults(Recipe::Tandem, Task::Push, 2);
         (config.name, config.seed) = ("push-ea-seed3".to_owned(), 3);
         let run = PlannedRun { name: config.name.clone(), config, teacher: None };
-        RunStatus { run, dir: dir.to_owned(), state, failure: None, extends_to: None }
+        let dir = dir.to_owned();
+        RunStatus { run, dir, state, failure: None, left_out: None, extends_to: None }
     }
 
     #[test]
@@ -189,6 +192,11 @@ mod tests {
         assert_eq!(run().evaluations.last().map(|row| row.success), Some(0.25));
         board.ended(0, &statuses[0]);
         assert_eq!((run().state, run().env_steps), (SweepRunState::Saved, 1700));
+        let mut left_out = status(dir.path(), State::Started);
+        left_out.leave_out("another process still uses it".to_owned());
+        board.ended(0, &left_out);
+        assert_eq!(run().state, SweepRunState::LeftOut);
+        assert_eq!(run().failure, "another process still uses it");
         let summary =
             json!({"success": 0.5, "success_low": 0.4, "success_high": 0.6, "env_steps": 1800});
         board.ended(0, &status(dir.path(), State::Finished(summary)));

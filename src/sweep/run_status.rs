@@ -28,6 +28,8 @@ pub(super) struct RunStatus {
     pub(super) state: State,
     /// The reason why the latest attempt failed.
     pub(super) failure: Option<String>,
+    /// The reason why this start of the sweep did not train the run, although no attempt failed.
+    pub(super) left_out: Option<String>,
     /// The environment steps to which a run that had fewer is extended.
     pub(super) extends_to: Option<u64>,
 }
@@ -53,7 +55,7 @@ impl RunStatus {
         let (state, extends_to) = state(&run, &dir)?;
         let failure = std::fs::read_to_string(failure_path(&dir)).ok();
         let failure = failure.filter(|_| !matches!(state, State::Finished(_)));
-        Ok(Self { run, dir, state, failure, extends_to })
+        Ok(Self { run, dir, state, failure, left_out: None, extends_to })
     }
 
     /// Returns the name of the state.
@@ -78,9 +80,9 @@ impl RunStatus {
         (self.state, self.failure) = (State::Finished(summary), None);
     }
 
-    /// Notes why a run was not trained, for this start of the sweep.
-    pub(super) fn skip(&mut self, why: String) {
-        self.failure = Some(why);
+    /// Leaves a run out of this start of the sweep, for the reason `why`.
+    pub(super) fn leave_out(&mut self, why: String) {
+        self.left_out = Some(why);
     }
 
     /// Marks a run as failed, and stores the reason, which the next start reports.
@@ -101,11 +103,7 @@ fn failure_path(dir: &Path) -> PathBuf {
 }
 
 /// The setting in which a run may have less than the sweep file: such a run is extended.
-const LENGTH: &str = "stop.max_env_steps";
-
-/// The difference of a run whose settings are equal.
-const OTHER_TEACHER: &str = "its teacher is neither that of [teachers] nor, without one, the shipped one (to keep it, name \
-     the run's policy/teacher.* in [teachers])";
+pub(super) const LENGTH: &str = "stop.max_env_steps";
 
 /// Returns the state of the run in `dir`, and the length to which it is extended.
 pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Option<u64>)> {
@@ -120,8 +118,8 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
     };
     let length = run_directory::length(dir, existing.as_ref().ok());
     let summary = summary(dir)?.filter(|summary| run_summary::is_current(summary, length));
-    let has_same_teacher = same_teacher(run, dir);
-    if differences.is_empty() && has_same_teacher {
+    let other_teacher = other_teacher(run, dir);
+    if differences.is_empty() && other_teacher.is_none() {
         return Ok((summary.map_or(State::Started, State::Finished), None));
     }
     if summary.is_none() && !has_learned(dir) {
@@ -130,15 +128,23 @@ pub(super) fn state(run: &PlannedRun, dir: &Path) -> anyhow::Result<(State, Opti
     let planned_length = run.config.stop.max_env_steps;
     let is_longer =
         length.max_env_steps.is_some_and(|length| length > 0 && planned_length > length);
-    if is_longer && has_same_teacher && differences.iter().all(|(key, _)| key == LENGTH) {
+    // A larger length alone extends the run.
+    let refused = differences.into_iter().filter(|(key, _)| !is_longer || key != LENGTH);
+    let mut texts: Vec<String> = refused.map(|(_, text)| text).collect();
+    texts.extend(other_teacher.as_deref().map(teacher_difference));
+    if texts.is_empty() {
         return Ok((State::Started, Some(planned_length)));
     }
-    let texts: Vec<String> = differences.into_iter().map(|(_, text)| text).collect();
-    let differences = match texts.is_empty() {
-        true => OTHER_TEACHER.to_owned(),
-        false => texts.join(", "),
-    };
-    Err(anyhow!("{} was made with other settings: {differences}", run.name))
+    Err(anyhow!("{} was made with other settings: {}", run.name, texts.join(", ")))
+}
+
+/// Describes the teacher of an existing run, a copy, as another one than that of the sweep file.
+fn teacher_difference(copy: &Path) -> String {
+    let name = server_of(copy).unwrap_or_else(|| copy.display().to_string());
+    format!(
+        "its teacher is neither that of [teachers] nor, without one, the shipped one (to keep it, name {name:?} in \
+         [teachers])"
+    )
 }
 
 /// Returns the settings in which the configuration of an existing run differs from the sweep file, each with a text.
@@ -180,23 +186,27 @@ fn shortest(value: &Value) -> String {
 /// Files of a run's copy of its teacher: a policy file, the model of an actor, or the server of a policy.
 const TEACHER_COPIES: [&str; 3] = ["teacher.safetensors", "teacher.onnx", "teacher.toml"];
 
-/// Returns true if the run has the teacher that the sweep file names or, if it names none, the shipped one.
+/// Returns the run's copy of its teacher, if that is another one than the sweep file names or, if it names none, than
+/// the shipped one.
 ///
 /// A run without a copy of its teacher, and a teacher that does not exist, count as equal: `tandem train` reports both.
-fn same_teacher(run: &PlannedRun, dir: &Path) -> bool {
+fn other_teacher(run: &PlannedRun, dir: &Path) -> Option<PathBuf> {
     if !run.config.advice.needs_teacher() {
-        return true;
+        return None;
     }
     let copies = TEACHER_COPIES.map(|name| dir.join("policy").join(name));
-    let Some(copy) = copies.iter().find(|path| path.exists()) else { return true };
-    let Ok(teacher) = path_of_new_run(run.teacher.as_deref(), &run.config) else { return true };
-    if *copy != teacher_copy(&teacher, dir) {
-        return false;
-    }
-    if let Some(address) = policy_address(&teacher) {
+    let copy = copies.into_iter().find(|path| path.exists())?;
+    let teacher = path_of_new_run(run.teacher.as_deref(), &run.config).ok()?;
+    let is_same = copy == teacher_copy(&teacher, dir) && is_copy_of(&copy, &teacher);
+    (!is_same).then_some(copy)
+}
+
+/// Returns true if `copy` is a copy of `teacher`, which is of the same kind.
+fn is_copy_of(copy: &Path, teacher: &Path) -> bool {
+    if let Some(address) = policy_address(teacher) {
         return server_of(copy).is_none_or(|server| server == address);
     }
-    let Ok(teacher) = policy_file::file_of(&teacher) else { return true };
+    let Ok(teacher) = policy_file::file_of(teacher) else { return true };
     let [copied, current] = [copy, &*teacher].map(|path| regular_file::read(path).ok());
     let is_same_file = copied.zip(current).is_none_or(|(copied, current)| copied == current);
     is_same_file || has_same_digest(copy, &teacher)
@@ -208,7 +218,7 @@ fn has_same_digest(one: &Path, other: &Path) -> bool {
     one.zip(other).is_some_and(|(one, other)| one.digest() == other.digest())
 }
 
-/// Returns the URL of the server in a run's copy of its teacher.
+/// Returns the URL of the server in a run's copy of its teacher; `None` in that of a policy file or a model.
 fn server_of(copy: &Path) -> Option<String> {
     let table: Table = String::from_utf8(regular_file::read(copy).ok()?).ok()?.parse().ok()?;
     Some(table.get("address")?.as_str()?.to_owned())
@@ -405,11 +415,18 @@ mod tests {
         let content = std::fs::read(shipped).expect("a policy");
         assert_eq!(copy("teacher.safetensors", &content).expect("the shipped one"), "finished");
         let refused = copy("teacher.safetensors", b"another").expect_err("another teacher");
-        assert!(refused.contains("in [teachers])"), "{refused}");
+        assert!(refused.contains("policy/teacher.safetensors\" in [teachers])"), "{refused}");
+        let mut longer = planned(0.95);
+        longer.config.stop.max_env_steps *= 2;
+        let refused = RunStatus::of(longer, out.path()).expect_err("another teacher").to_string();
+        assert!(refused.contains("in [teachers])") && !refused.contains(LENGTH), "{refused}");
+        let refused = status(out.path(), 0.9).expect_err("a setting and the teacher");
+        assert!(refused.contains("ddpg.discount") && refused.contains("[teachers]"), "{refused}");
         std::fs::remove_file(policies.join("teacher.safetensors")).expect("removes");
         assert_eq!(status(out.path(), 0.95).expect("no copy").state_name(), "finished");
         let server = b"address = \"http://127.0.0.1:7005\"\ndigest = \"5f3a\"\n";
-        assert!(copy("teacher.toml", server).is_err(), "the policy of a server");
+        let refused = copy("teacher.toml", server).expect_err("the policy of a server");
+        assert!(refused.contains("name \"http://127.0.0.1:7005\" in [teachers]"), "{refused}");
         let of_server = |address: &str| {
             let run = PlannedRun { teacher: Some(address.into()), ..planned(0.95) };
             RunStatus::of(run, out.path()).map(|status| status.state_name())
@@ -418,6 +435,6 @@ mod tests {
         assert!(of_server("http://127.0.0.1:7006").is_err(), "another server");
         let mut unadvised = planned(0.95);
         unadvised.config.advice.strategy = "none".to_owned();
-        assert!(same_teacher(&unadvised, &out.path().join("push-ea-seed1")));
+        assert_eq!(other_teacher(&unadvised, &out.path().join("push-ea-seed1")), None);
     }
 }

@@ -285,36 +285,111 @@ fn unusable_inputs_are_reported_in_one_line() {
     assert!(!directory.path().join("mended").exists(), "garbage was recovered");
 }
 
-#[test]
-fn a_report_prints_its_tables_without_a_page_and_replaces_no_file_of_a_run() {
-    let directory = tempfile::tempdir().expect("a directory");
-    prepare(directory.path());
-    let path = |name: &str| directory.path().join(name).display().to_string();
-    let recorded = format!(
-        "{}/docs/results/students/shared-push-2-mc-q-0.1-seed1/metrics.jsonl",
-        env!("CARGO_MANIFEST_DIR")
-    );
-    let metrics = fs::read(recorded).expect("metrics");
-    fs::create_dir(path("done")).expect("created");
-    fs::write(path("done/metrics.jsonl"), &metrics).expect("written");
-    let report = |option: &str, file: &str| {
-        let (run, file) = (path("done"), path(file));
-        let args = ["report", &run, option, &file];
-        let output = command(&args, directory.path()).output().expect("runs");
+/// Options of a report, each with a path.
+type Options<'a> = &'a [(&'a str, &'a str)];
+
+/// A directory with the run `done`, of which reports are made.
+struct Reports {
+    directory: TempDir,
+    metrics: Vec<u8>,
+}
+
+impl Reports {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        prepare(directory.path());
+        let recorded = format!(
+            "{}/docs/results/students/shared-push-2-mc-q-0.1-seed1/metrics.jsonl",
+            env!("CARGO_MANIFEST_DIR")
+        );
+        let metrics = fs::read(recorded).expect("metrics");
+        fs::create_dir(directory.path().join("done")).expect("created");
+        fs::write(directory.path().join("done/metrics.jsonl"), &metrics).expect("written");
+        Self { directory, metrics }
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.directory.path().join(name).display().to_string()
+    }
+
+    /// Makes the report of `run` with `options`, whose paths are in the directory. Returns its exit code and output.
+    fn of(&self, run: &str, options: Options<'_>) -> (Option<i32>, String, String) {
+        let mut args = vec!["report".to_owned(), self.path(run)];
+        let options = options.iter().flat_map(|(name, path)| [(*name).to_owned(), self.path(path)]);
+        args.extend(options);
+        let args: Vec<&str> = args.iter().map(String::as_str).collect();
+        let output = command(&args, self.directory.path()).output().expect("runs");
         let [stdout, stderr] = [output.stdout, output.stderr].map(String::from_utf8);
         (output.status.code(), stdout.expect("text"), stderr.expect("text"))
-    };
-    let (code, tables, message) = report("--out", "empty/x.html");
+    }
+}
+
+#[test]
+fn a_report_prints_its_tables_without_a_page_and_replaces_no_file_of_a_run() {
+    let reports = Reports::new();
+    let (code, tables, message) = reports.of("done", &[("--out", "empty/x.html")]);
     assert_eq!(code, Some(64), "{message}");
     assert!(message.contains("choose another --out"), "{message}");
     assert!(
         tables.contains("success of the policy alone") && !tables.contains("report  "),
         "{tables}"
     );
-    let (code, tables, message) = report("--csv", "done/metrics.jsonl");
-    assert_eq!((code, tables.as_str()), (Some(64), ""), "{message}");
-    assert!(message.contains("the report reads this file"), "{message}");
-    assert_eq!(fs::read(path("done/metrics.jsonl")).expect("there"), metrics);
+    let policy = fs::read(shipped("student-push")).expect("ships");
+    fs::create_dir(reports.path("done/policy")).expect("created");
+    fs::write(reports.path("done/policy/best.safetensors"), &policy).expect("written");
+    fs::create_dir(reports.path("other")).expect("created");
+    fs::write(reports.path("other/metrics.jsonl"), &reports.metrics).expect("written");
+    let best = ("--csv", "done/policy/best.safetensors");
+    let cases: [(&str, Options<'_>, &str); 5] = [
+        ("done", &[("--csv", "done/metrics.jsonl")], "that the report reads"),
+        ("done", &[best], "that the report reads"),
+        ("done", &[("--markdown", "done/policy/teacher.toml")], "that the report reads"),
+        ("other", &[best, ("--film-strips", "done")], "--film-strips is the same file"),
+        ("other", &[best, ("--composed-teachers", "done")], "--composed-teachers is the same file"),
+    ];
+    for (run, options, expected) in cases {
+        let (code, tables, message) = reports.of(run, options);
+        assert_eq!((code, tables.as_str()), (Some(64), ""), "{options:?}: {message}");
+        assert!(message.contains(expected), "{options:?}: {message}");
+    }
+    let content = |name: &str| fs::read(reports.path(name)).expect("there");
+    assert!(content("done/metrics.jsonl") == reports.metrics, "the metrics are replaced");
+    assert!(content("done/policy/best.safetensors") == policy, "the policy is replaced");
+}
+
+#[test]
+fn a_report_lists_the_files_that_it_has_written_and_reports_each_other_one() {
+    let reports = Reports::new();
+    let (page, no_page) = (("--out", "x.html"), ("--out", "empty/x.html"));
+    let (csv, no_csv) = (("--csv", "x.csv"), ("--csv", "/proc/x.csv"));
+    let markdown = ("--markdown", "m.md");
+    let no_page_message = "the page is not written, choose another --out";
+    let cases: [(Options<'_>, &[&str], &[&str]); 3] = [
+        (&[page, no_csv, markdown], &["report", "markdown"], &["cannot write /proc/x.csv"]),
+        (&[no_page, csv], &["csv"], &[no_page_message]),
+        (
+            &[no_page, no_csv, markdown],
+            &["markdown"],
+            &["cannot write /proc/x.csv", no_page_message],
+        ),
+    ];
+    for (options, listed, failed) in cases {
+        let (code, tables, message) = reports.of("done", options);
+        assert_eq!(code, Some(64), "{options:?}: {message}");
+        let paths = [("report", "x.html"), ("csv", "x.csv"), ("markdown", "m.md")];
+        for (label, name) in paths {
+            let is_listed = tables.contains(&format!("{label:<13} {}\n", reports.path(name)));
+            assert_eq!(is_listed, listed.contains(&label), "{options:?}: {tables}");
+            assert_eq!(fs::remove_file(reports.path(name)).is_ok(), is_listed, "{name}");
+        }
+        assert!(!tables.contains("/proc/") && !tables.contains("empty/"), "{options:?}: {tables}");
+        let errors: Vec<&str> =
+            message.lines().filter(|line| line.starts_with("tandem: ")).collect();
+        assert_eq!(errors.len(), failed.len(), "{options:?}: {message}");
+        for (error, expected) in errors.iter().zip(failed) {
+            assert!(error.contains(expected), "{options:?}: {error}");
+        }
+    }
 }
 
 #[test]
