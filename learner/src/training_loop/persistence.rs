@@ -102,7 +102,8 @@ impl<'a> Persistence<'a> {
     }
 
     /// Saves a checkpoint unless the newest one contains this state and the run's wall time, and writes the records. A
-    /// failure leaves the former checkpoint in place.
+    /// failure leaves the former checkpoint in place. If only the wall time is missing in that one, nothing counts as
+    /// unwritten.
     pub(super) fn save(&mut self, state: &mut LoopState<'_, '_>) {
         let key = state.key();
         if self.saved != Some(key) || state.wall_s > self.saved_wall_s + MAX_UNSAVED_S {
@@ -140,7 +141,11 @@ impl<'a> Persistence<'a> {
             Err(error) => {
                 self.timings.checkpoint_failures.inc();
                 let cause = innermost(&error);
-                self.unwritten_checkpoint = Some(UnwrittenFile { what, cause });
+                if self.saved == Some(key) {
+                    tracing::warn!(cause, "cannot update the wall time in the newest checkpoint");
+                } else {
+                    self.unwritten_checkpoint = Some(UnwrittenFile { what, cause });
+                }
             }
         }
     }
