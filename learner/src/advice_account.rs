@@ -367,8 +367,8 @@ impl AdviceAccount {
         let name = self.terms.name.clone();
         match self.balance()? {
             Some(found) if units_left(&found) <= left => {
-                if found.budget < self.terms.budget {
-                    let (got, asked) = (found.budget, self.terms.budget);
+                if found.budget < self.full_budget {
+                    let (got, asked) = (found.budget, self.full_budget);
                     warn!(account = name, budget = got, asked, "continuing with a smaller account");
                 }
                 self.open_account(found.budget.min(self.terms.budget), spent).map(drop)
