@@ -39,6 +39,7 @@ pub(super) struct LoopState<'a, 'c> {
     pub(super) evaluations: &'a mut Evaluations<'c>,
     pub(super) wall_s: f64,
     pub(super) teacher_policy: Option<&'a str>,
+    pub(super) had_other_policy: bool,
     pub(super) renamed_account: Option<&'a RenamedAccount>,
 }
 
@@ -126,6 +127,7 @@ impl<'a> Persistence<'a> {
             pending: state.evaluations.pending().iter().cloned().collect(),
             wall_s: state.wall_s,
             teacher_policy: state.teacher_policy.map(str::to_owned),
+            had_other_policy: state.had_other_policy,
             account: state.renamed_account.cloned(),
         };
         let directory = self.config.out.join("checkpoint");
