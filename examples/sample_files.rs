@@ -30,20 +30,31 @@ fn write_ledger(path: &Path) -> Result<(), AnyError> {
         return Err(format!("{path:?} already exists").into());
     }
     let mut ledger = SqliteLedger::open(path)?;
-    ledger.open("unleased", AccountTerms { budget: 10, strategy: "mc-q:0.1".parse()? })?;
-    ledger.open("leased", AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? })?;
+    let unleased = AccountTerms { budget: 10, strategy: "mc-q:0.1".parse()? };
+    let leased = AccountTerms { budget: 1000, strategy: "eamc:0.25".parse()? };
+    ledger.open("unleased", unleased)?;
+    ledger.open("leased", leased)?;
     ledger.open_leases("leased", &[0, 1], 50)?;
-    let charges = |account: &str, episode, steps: std::ops::Range<u32>, wanted_in| ChargeRequest {
+    let of_unleased = |charges| ChargeRequest {
+        account: "unleased".to_owned(),
+        strategy: unleased.strategy,
         episode_steps: 50,
-        account: account.to_owned(),
-        charges: steps.map(|step| Charge { episode, step, wanted_in }).collect(),
+        charges,
+    };
+    let of_leased = |charges| ChargeRequest {
+        account: "leased".to_owned(),
+        strategy: leased.strategy,
+        ..of_unleased(charges)
+    };
+    let charges = |episode, steps: std::ops::Range<u32>, wanted_in| -> Vec<Charge> {
+        steps.map(|step| Charge { episode, step, wanted_in }).collect()
     };
     let (always, never) = (BudgetHalves::BOTH, BudgetHalves::NONE);
     for bill in [
-        charges("unleased", 3, 0..12, always),
-        charges("leased", 0, 0..20, always),
-        charges("leased", 0, 20..50, never),
-        charges("leased", 1, 0..5, always),
+        of_unleased(charges(3, 0..12, always)),
+        of_leased(charges(0, 0..20, always)),
+        of_leased(charges(0, 20..50, never)),
+        of_leased(charges(1, 0..5, always)),
     ] {
         ledger.charge(&[bill]).into_iter().collect::<Result<Vec<_>, _>>()?;
     }

@@ -92,6 +92,8 @@ pub(crate) struct AccountOptions<'a> {
     pub(crate) renamed: Option<RenamedAccount>,
     /// The digest of the teacher's policy when the run began, if it is known.
     pub(crate) first_policy: Option<String>,
+    /// True if the teacher has advised by another policy, too, in earlier parts of the run.
+    pub(crate) had_other_policy: bool,
     /// Receives the state of the teacher.
     pub(crate) view: watch::Sender<TeacherView>,
     /// Measures for how long the teacher has not answered.
@@ -134,7 +136,8 @@ impl AdviceAccount {
         shutdown: &CancellationToken,
     ) -> Result<Self, TeacherError> {
         let AccountOptions { client_config, address, one_arm, mut terms, .. } = options;
-        let AccountOptions { start, renamed, first_policy, view, clock, .. } = options;
+        let AccountOptions { start, renamed, view, clock, .. } = options;
+        let AccountOptions { first_policy, had_other_policy, .. } = options;
         let inside = runtime.enter();
         let client = TeacherClient::new(client_config.channel(address)?);
         drop(inside);
@@ -159,7 +162,7 @@ impl AdviceAccount {
         };
         let policy = account.check_task(one_arm)?;
         account.policy = first_policy.unwrap_or_else(|| policy.clone());
-        warn_of_other_policy(warnings, &policy, &account.policy);
+        warn_of_other_policy(warnings, &policy, &account.policy, had_other_policy);
         account.begin(start, warnings)?;
         let first = account.policy.clone();
         let watcher = AccountWatcher::new((client, first), lost, (warnings.clone(), view), clock);
@@ -367,8 +370,8 @@ impl AdviceAccount {
         let name = self.terms.name.clone();
         match self.balance()? {
             Some(found) if units_left(&found) <= left => {
-                if found.budget < self.terms.budget {
-                    let (got, asked) = (found.budget, self.terms.budget);
+                if found.budget < self.full_budget {
+                    let (got, asked) = (found.budget, self.full_budget);
                     warn!(account = name, budget = got, asked, "continuing with a smaller account");
                 }
                 self.open_account(found.budget.min(self.terms.budget), spent).map(drop)

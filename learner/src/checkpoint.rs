@@ -34,6 +34,8 @@ pub struct Resumption {
     /// The digest of the teacher's policy when the run began. `None` for a run without a teacher, and for one of an
     /// earlier version.
     pub teacher_policy: Option<String>,
+    /// True if the teacher has also advised by another policy since. False for a run of an earlier version.
+    pub had_other_policy: bool,
     /// The run's account at the teacher, unless it has the run's name.
     pub account: Option<RenamedAccount>,
 }
@@ -57,6 +59,7 @@ impl Resumption {
             pending: Vec::new(),
             wall_s: 0.0,
             teacher_policy: None,
+            had_other_policy: false,
             account: None,
         }
     }

@@ -27,6 +27,11 @@ impl Connections {
         (self.n_ever, true)
     }
 
+    /// Returns true if the open connection `number` is the one with the signal `closed`.
+    pub(crate) fn is_same(&self, number: u64, closed: &ConnectionClosed) -> bool {
+        self.open.get(&number).is_some_and(|known| known.is_same(closed))
+    }
+
     /// Removes a closed connection.
     pub(crate) fn remove(&mut self, number: u64) {
         self.open.remove(&number);

@@ -358,13 +358,16 @@ impl LearnerService {
         number
     }
 
-    /// Attaches a worker that calls again after its connection has ended to its new connection.
+    /// Attaches a worker that calls over another connection than before to its new connection.
     fn attach(&self, worker_id: u64, closed: ConnectionClosed) {
         let mut state = self.shared.lock();
-        if state.queue.worker(worker_id).is_some_and(|worker| worker.connection.is_none()) {
-            let connection = self.register(&mut state, closed);
-            state.queue.attach(worker_id, connection);
+        let Some(worker) = state.queue.worker(worker_id) else { return };
+        let current = worker.connection;
+        if current.is_some_and(|current| state.connections.is_same(current, &closed)) {
+            return;
         }
+        let connection = self.register(&mut state, closed);
+        state.queue.attach(worker_id, connection);
     }
 
     /// Returns the work for a worker, and the time after which to retry if there is none.

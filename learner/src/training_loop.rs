@@ -110,6 +110,8 @@ struct LearnerLoop<'a> {
     account: Option<AdviceAccount>,
     /// The digest of the teacher's policy when the run began, if it is known.
     teacher_policy: Option<String>,
+    /// True if the teacher advised by another policy, too, before this learner started.
+    had_other_policy: bool,
     /// The account, unless it has the run's name.
     renamed_account: Option<RenamedAccount>,
     evaluations: Evaluations<'a>,
@@ -385,12 +387,14 @@ impl LearnerLoop<'_> {
 impl<'a> LearnerLoop<'a> {
     /// Borrows the persistence together with the state that it writes.
     fn persistence_and_state(&mut self) -> (&mut Persistence<'a>, LoopState<'_, 'a>) {
+        let warns_of_policy = self.context.shared.warnings.of(Source::Policy).is_some();
         let state = LoopState {
             trainer: &self.trainer,
             acting: &self.acting,
             evaluations: &mut self.evaluations,
             wall_s: self.progress.wall_s(),
             teacher_policy: self.teacher_policy.as_deref(),
+            had_other_policy: self.had_other_policy || warns_of_policy,
             renamed_account: self.renamed_account.as_ref(),
         };
         (&mut self.persistence, state)

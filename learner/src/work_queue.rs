@@ -133,18 +133,8 @@ impl WorkQueue {
         if !self.newcomers.remove(&worker_id) {
             self.requeue_slots_of(worker_id);
         }
-        let Some(Worker { connection: Some(number), n_episodes, .. }) =
-            self.workers.remove(&worker_id)
-        else {
-            return;
-        };
-        if let Some(connection) = self.connections.get_mut(&number) {
-            connection.workers.remove(&worker_id);
-            connection.n_unproven -= usize::from(n_episodes == 0);
-            if connection.workers.is_empty() {
-                self.connections.remove(&number);
-            }
-        }
+        self.detach(worker_id);
+        self.workers.remove(&worker_id);
     }
 
     /// Records that a worker has delivered a slot, with `n_new` episodes that count.

@@ -190,7 +190,7 @@ impl Advisor {
             .collect();
         let charged = self.charge(&charges);
         self.warn_of_reused_steps(&charges, &charged);
-        self.forget_lost_accounts(&charges, &charged);
+        self.forget_former_strategies(&charges, &charged);
         let mut charged = charged.into_iter();
         let mut answer = |scored: ScoredRequest<'_>| {
             let charged = if scored.arms.is_empty() {
@@ -199,12 +199,10 @@ impl Advisor {
                     verdicts: Vec::new(),
                     repeated: Vec::new(),
                     left: balance.left,
-                    strategy: balance.terms.strategy,
                 })
             } else {
                 charged.next().expect("one result for each request")
             };
-            let charged = charged.and_then(|charged| self.check_strategy(&scored, charged));
             scored.into_advice(&self.info, charged)
         };
         scored.into_iter().map(|scored| answer(scored?)).collect()
@@ -277,33 +275,22 @@ impl Advisor {
         results
     }
 
-    /// Forgets the strategies of accounts that a server has lost: they may be opened again with others, by other teachers.
-    fn forget_lost_accounts(
+    /// Forgets the strategies of accounts that a server has lost: other teachers may open them anew with others, or
+    /// have done so. A repeated request is answered by the account's strategy.
+    fn forget_former_strategies(
         &mut self,
         requests: &[ChargeRequest],
         results: &[Result<ChargeResult, LedgerError>],
     ) {
         for (request, result) in requests.iter().zip(results) {
-            if matches!(result, Err(LedgerError::Budget(BudgetError::UnknownAccount(_)))) {
+            if let Err(
+                LedgerError::Budget(BudgetError::UnknownAccount(_))
+                | LedgerError::OtherStrategy { .. },
+            ) = result
+            {
                 self.strategies.remove(&request.account);
             }
         }
-    }
-
-    /// Refuses to answer by another strategy than the account has: a server has lost the account, and another teacher
-    /// has opened it anew. The repeated request is answered by the account's strategy.
-    fn check_strategy(
-        &mut self,
-        scored: &ScoredRequest<'_>,
-        charged: ChargeResult,
-    ) -> Result<ChargeResult, LedgerError> {
-        if charged.strategy == scored.strategy {
-            return Ok(charged);
-        }
-        let account = &scored.request.account;
-        self.strategies.remove(account);
-        let what = format!("account {account:?} now has strategy {}: ask again", charged.strategy);
-        Err(LedgerError::Unavailable { what, source: None })
     }
 
     /// Warns, once for each account, if a step was charged that the strategy would not charge now: the account remembers
@@ -363,8 +350,13 @@ impl ScoredRequest<'_> {
                 None => charges.push(Charge { episode: payer(query), step: query.step, wanted_in }),
             }
         }
-        let account = || self.request.account.clone();
-        (!charges.is_empty()).then(|| ChargeRequest { account: account(), episode_steps, charges })
+        let (account, strategy) = (|| self.request.account.clone(), self.strategy);
+        (!charges.is_empty()).then(|| ChargeRequest {
+            account: account(),
+            strategy,
+            episode_steps,
+            charges,
+        })
     }
 
     /// Returns the answer, given the verdicts on the charges.

@@ -20,10 +20,13 @@ pub use redis::RedisLedger;
 pub use sqlite::SqliteLedger;
 
 /// The charges of one request for advice to one account. Either all of them are made, in their order, or none.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ChargeRequest {
     /// The account's name.
     pub account: String,
+    /// The strategy by which the charges were decided. It is not the account's if a server has lost the account and
+    /// another teacher has opened it anew.
+    pub strategy: Strategy,
     /// Steps of an episode of a run, which has a lease.
     pub episode_steps: u32,
     /// At least one step.
@@ -39,9 +42,6 @@ pub struct ChargeResult {
     pub repeated: Vec<bool>,
     /// Units that are neither spent nor leased after the charges.
     pub left: u64,
-    /// The strategy of the account. It is not the one that callers know if a server has lost the account and another
-    /// teacher has opened it anew.
-    pub strategy: Strategy,
 }
 
 /// The reason why a ledger refuses an operation.
@@ -50,6 +50,15 @@ pub enum LedgerError {
     /// The account is unknown or has other terms. Nothing has changed.
     #[error(transparent)]
     Budget(#[from] BudgetError),
+    /// The account has another strategy than the one by which the charges were decided. Nothing has changed. The caller
+    /// may repeat the request with charges that are decided by this strategy.
+    #[error("account {account:?} now has strategy {strategy}: ask again")]
+    OtherStrategy {
+        /// The account's name.
+        account: String,
+        /// The account's strategy.
+        strategy: Strategy,
+    },
     /// A step lies beyond the end of an episode that has a lease. Nothing has changed.
     #[error("charge {charge_idx} is for a step beyond the end of an episode that has a lease")]
     BeyondEnd {
@@ -231,6 +240,14 @@ fn check_terms(name: &str, open: AccountTerms, requested: AccountTerms) -> Resul
     Ok(())
 }
 
+/// Refuses charges that were decided by another strategy than the account's.
+fn check_strategy(request: &ChargeRequest, strategy: Strategy) -> Result<(), LedgerError> {
+    if request.strategy != strategy {
+        return Err(LedgerError::OtherStrategy { account: request.account.clone(), strategy });
+    }
+    Ok(())
+}
+
 fn unknown_account(name: &str) -> LedgerError {
     BudgetError::UnknownAccount(name.to_owned()).into()
 }
@@ -240,6 +257,7 @@ fn charge_all(
     account: &mut Transaction<'_>,
     request: &ChargeRequest,
 ) -> Result<ChargeResult, LedgerError> {
+    check_strategy(request, account.terms().strategy)?;
     let ChargeRequest { charges, episode_steps, .. } = request;
     let is_beyond_end = |charge: &Charge| is_beyond_end(account, charge, *episode_steps);
     if let Some(charge_idx) = charges.iter().position(is_beyond_end) {
@@ -248,8 +266,7 @@ fn charge_all(
     let charged =
         charges.iter().map(|charge| (account.has_verdict(*charge), account.charge(*charge)));
     let (repeated, verdicts) = charged.unzip();
-    let strategy = account.terms().strategy;
-    Ok(ChargeResult { verdicts, repeated, left: account.left(), strategy })
+    Ok(ChargeResult { verdicts, repeated, left: account.left() })
 }
 
 /// Returns true if the step lies beyond the end of an episode with a lease. Episodes of a run have leases and

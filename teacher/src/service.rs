@@ -257,7 +257,7 @@ fn status(error: &Error) -> Status {
             Status::already_exists(message)
         }
         Error::RemotePolicy(RemoteError::Changed { .. }) => Status::failed_precondition(message),
-        Error::Ledger(LedgerError::Unavailable { .. })
+        Error::Ledger(LedgerError::Unavailable { .. } | LedgerError::OtherStrategy { .. })
         | Error::LedgerNeedsRestart
         | Error::Timeout(_)
         | Error::RemotePolicy(RemoteError::Unavailable { .. }) => Status::unavailable(message),

@@ -87,7 +87,13 @@ fn a_ledger_keeps_its_accounts_leases_and_verdicts() {
         // A charged step is not charged again. The next step is charged to the open lease.
         let charge = |step| Charge { episode: 1, step, wanted_in: BudgetHalves::BOTH };
         let charges = vec![charge(4), charge(5)];
-        let request = ChargeRequest { account: "leased".to_owned(), episode_steps: 50, charges };
+        let balance = ledger.balance("leased").expect("an account");
+        let request = ChargeRequest {
+            account: "leased".to_owned(),
+            strategy: balance.terms.strategy,
+            episode_steps: 50,
+            charges,
+        };
         ledger.charge(&[request]).remove(0).expect("charged");
         let balance = ledger.balance("leased").expect("an account");
         let former = |key: &str| accounts["leased"][key].as_u64().expect("units");

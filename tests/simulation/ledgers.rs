@@ -95,8 +95,7 @@ impl ForgetfulLedger {
         let charge = |(step, charge): (u32, &Charge)| account.charge(Charge { step, ..*charge });
         let verdicts = (first_step..).zip(&request.charges).map(charge).collect();
         let repeated = vec![false; request.charges.len()];
-        let AccountTerms { strategy, .. } = account.terms();
-        Ok(ChargeResult { verdicts, repeated, left: account.left(), strategy })
+        Ok(ChargeResult { verdicts, repeated, left: account.left() })
     }
 }
 

@@ -70,6 +70,7 @@ fn resumption(trainer: &Trainer) -> Resumption {
         pending: vec![pending],
         wall_s: 2.5,
         teacher_policy: Some("5f3a".repeat(16)),
+        had_other_policy: false,
         account: None,
     }
 }

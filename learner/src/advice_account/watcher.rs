@@ -64,16 +64,16 @@ impl AccountWatcher {
         let look = self.client.describe(pb::DescribeRequest {});
         let Ok(described) = within(CALL_DEADLINE, look).await else { return };
         let now = described.into_inner().policy_digest;
-        warn_of_other_policy(&self.status.warnings, &now, &self.policy);
+        warn_of_other_policy(&self.status.warnings, &now, &self.policy, false);
     }
 }
 
 /// Warns if the teacher was restarted with another policy than the `first` one, perhaps for another task: requests for
 /// advice do not name the policy. The warning remains, with another text, once the first policy is back, because the
-/// run has learned from the other one's advice.
-pub(super) fn warn_of_other_policy(warnings: &Warnings, now: &str, first: &str) {
+/// run has learned from the other one's advice. `had_other` is true if an earlier part of the run had this warning.
+pub(super) fn warn_of_other_policy(warnings: &Warnings, now: &str, first: &str, had_other: bool) {
     let is_first = now == first;
-    if is_first && warnings.of(Source::Policy).is_none() {
+    if is_first && !had_other && warnings.of(Source::Policy).is_none() {
         return;
     }
     let shown = |digest: &str| digest.chars().take(N_DIGEST_CHARS).collect::<String>();
@@ -179,7 +179,7 @@ mod tests {
             ("a1", both.to_owned()),
             ("b2", other("b2")),
         ] {
-            warn_of_other_policy(&warnings, now, "a1");
+            warn_of_other_policy(&warnings, now, "a1", false);
             assert_eq!(shown.borrow().warning, expected);
         }
     }

@@ -28,6 +28,8 @@ const JUMP_START: [&str; 4] =
 
 /// Key of the digest of the teacher's policy.
 const TEACHER_POLICY: &str = "teacher_policy";
+/// Key that is there if the teacher has advised by another policy, too.
+const OTHER_POLICY: &str = "teacher_policy.other";
 /// Keys of the run's account at the teacher, if it does not have the run's name.
 const ACCOUNT_NAME: &str = "advice_account.name";
 const ACCOUNT_BUDGET: &str = "advice_account.budget";
@@ -67,6 +69,9 @@ pub(super) fn metadata(trainer: &Trainer, resumption: &Resumption) -> Vec<(&'sta
     });
     entries.extend(jump_start);
     entries.extend(resumption.teacher_policy.iter().map(|digest| (TEACHER_POLICY, digest.clone())));
+    if resumption.had_other_policy {
+        entries.push((OTHER_POLICY, true.to_string()));
+    }
     if let Some(RenamedAccount { name, budget }) = &resumption.account {
         entries.extend([(ACCOUNT_NAME, name.clone()), (ACCOUNT_BUDGET, budget.to_string())]);
     }
@@ -207,6 +212,7 @@ impl Reader<'_> {
             pending: self.pending(trainer)?,
             wall_s: wall_s.filter(is_time).ok_or("its wall_s is not a time")?,
             teacher_policy: self.contents.metadata.get(TEACHER_POLICY).cloned(),
+            had_other_policy: self.contents.metadata.contains_key(OTHER_POLICY),
             account: self.account()?,
         })
     }

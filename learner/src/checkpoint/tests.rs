@@ -70,6 +70,7 @@ fn resumption(trainer: &Trainer) -> Resumption {
         }],
         wall_s: 12.5,
         teacher_policy: Some("5f3a".to_owned()),
+        had_other_policy: true,
         account: Some(RenamedAccount { name: "toy.from-140".to_owned(), budget: 9860 }),
     }
 }
@@ -121,15 +122,21 @@ fn a_checkpoint_without_the_teachers_policy_and_account_can_be_resumed() {
     let directory = tempfile::tempdir().expect("a directory");
     let mut trainer = Trainer::new(small_config()).expect("valid");
     train_round(&mut trainer);
-    let without = Resumption { teacher_policy: None, account: None, ..resumption(&trainer) };
+    let without = Resumption {
+        teacher_policy: None,
+        had_other_policy: false,
+        account: None,
+        ..resumption(&trainer)
+    };
     let path = save(directory.path(), &trainer, &without, 1).expect("saves").path;
     let bytes = fs::read(path).expect("readable");
     for key in ["teacher_policy", "advice_account"] {
         let is_there = bytes.windows(key.len()).any(|window| window == key.as_bytes());
         assert!(!is_there, "{key}: earlier versions did not write it");
     }
-    let Resumption { teacher_policy, account, .. } = restored(&directory).resumption;
-    assert_eq!((teacher_policy, account), (None, None));
+    let Resumption { teacher_policy, had_other_policy, account, .. } =
+        restored(&directory).resumption;
+    assert_eq!((teacher_policy, had_other_policy, account), (None, false, None));
 }
 
 #[test]

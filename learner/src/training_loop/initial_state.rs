@@ -103,6 +103,7 @@ impl InitialState {
             },
             renamed: self.resumption.account.clone(),
             first_policy: self.resumption.teacher_policy.clone(),
+            had_other_policy: self.resumption.had_other_policy,
             view: context.shared.teacher.clone(),
             clock: config.clock.clone(),
             start: match self.is_resumed {
@@ -164,8 +165,8 @@ impl<'a> LearnerLoop<'a> {
     ) -> Self {
         let Context { config, shared, .. } = context;
         let InitialState { trainer, resumption, lock, .. } = initial;
-        let Resumption { acting, history, pending, wall_s, teacher_policy, account: renamed } =
-            resumption;
+        let Resumption { acting, history, pending, wall_s, teacher_policy, .. } = resumption;
+        let Resumption { had_other_policy, account: renamed, .. } = resumption;
         let policy = account.as_ref().and_then(AdviceAccount::policy).map(str::to_owned);
         let renamed_account = account.as_ref().and_then(AdviceAccount::renamed).or(renamed);
         let terms = RunTerms {
@@ -186,6 +187,7 @@ impl<'a> LearnerLoop<'a> {
             acting,
             account,
             teacher_policy: policy.or(teacher_policy),
+            had_other_policy,
             renamed_account,
             evaluations: Evaluations::new(config, history, pending, started_s),
             persistence: Persistence::new(config, shared, lock),

@@ -39,6 +39,7 @@ pub(super) struct LoopState<'a, 'c> {
     pub(super) evaluations: &'a mut Evaluations<'c>,
     pub(super) wall_s: f64,
     pub(super) teacher_policy: Option<&'a str>,
+    pub(super) had_other_policy: bool,
     pub(super) renamed_account: Option<&'a RenamedAccount>,
 }
 
@@ -102,7 +103,8 @@ impl<'a> Persistence<'a> {
     }
 
     /// Saves a checkpoint unless the newest one contains this state and the run's wall time, and writes the records. A
-    /// failure leaves the former checkpoint in place.
+    /// failure leaves the former checkpoint in place. If only the wall time is missing in that one, nothing counts as
+    /// unwritten.
     pub(super) fn save(&mut self, state: &mut LoopState<'_, '_>) {
         let key = state.key();
         if self.saved != Some(key) || state.wall_s > self.saved_wall_s + MAX_UNSAVED_S {
@@ -125,6 +127,7 @@ impl<'a> Persistence<'a> {
             pending: state.evaluations.pending().iter().cloned().collect(),
             wall_s: state.wall_s,
             teacher_policy: state.teacher_policy.map(str::to_owned),
+            had_other_policy: state.had_other_policy,
             account: state.renamed_account.cloned(),
         };
         let directory = self.config.out.join("checkpoint");
@@ -140,7 +143,11 @@ impl<'a> Persistence<'a> {
             Err(error) => {
                 self.timings.checkpoint_failures.inc();
                 let cause = innermost(&error);
-                self.unwritten_checkpoint = Some(UnwrittenFile { what, cause });
+                if self.saved == Some(key) {
+                    tracing::warn!(cause, "cannot update the wall time in the newest checkpoint");
+                } else {
+                    self.unwritten_checkpoint = Some(UnwrittenFile { what, cause });
+                }
             }
         }
     }

@@ -150,3 +150,24 @@ async fn the_wall_time_after_a_checkpoint_is_saved_too() {
     })
     .await;
 }
+
+#[tokio::test]
+async fn a_run_whose_checkpoint_lacks_only_wall_time_can_be_interrupted_without_a_write() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("checkpoint");
+    with_loop(directory.path(), move |learner, time| {
+        time.set_millis(5_000);
+        learner.save();
+        let in_the_way = path.join("00000000.safetensors.tmp");
+        std::fs::create_dir(&in_the_way).expect("creates");
+        time.set_millis(25_000);
+        let outcome = learner.finish(None).expect("the checkpoint is complete");
+        assert!(outcome.interrupted, "{outcome:?}");
+        assert_eq!(learner.context.shared.progress.borrow().warning, "");
+        std::fs::remove_dir(&in_the_way).expect("removes");
+        let run = &learner.context.config.run;
+        let restored = checkpoint::load_newest(&path, run).expect("whole").expect("saved");
+        assert_eq!(restored.resumption.wall_s, 5.0);
+    })
+    .await;
+}

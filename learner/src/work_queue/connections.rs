@@ -15,12 +15,16 @@ pub(super) struct Connection {
 }
 
 impl WorkQueue {
-    /// Records that a worker without an open connection calls over `connection`: one that joins, or that was cut off and
-    /// calls again. A connection with [`MAX_UNPROVEN_PER_CONNECTION`] gets no further ones.
+    /// Records that a worker calls over `connection`: one that joins, or that was cut off and calls again, perhaps
+    /// before the learner notices the end of its former connection. A connection with [`MAX_UNPROVEN_PER_CONNECTION`]
+    /// gets no further ones.
     pub fn attach(&mut self, worker_id: u64, connection: u64) {
+        if self.worker(worker_id).is_some_and(|worker| worker.connection == Some(connection)) {
+            return;
+        }
+        self.detach(worker_id);
         let is_full = self.n_unproven(connection) >= MAX_UNPROVEN_PER_CONNECTION;
-        let worker = self.workers.get_mut(&worker_id);
-        let Some(worker) = worker.filter(|worker| worker.connection.is_none()) else { return };
+        let Some(worker) = self.workers.get_mut(&worker_id) else { return };
         let is_unproven = worker.n_episodes == 0;
         if is_unproven && is_full {
             return;
@@ -29,6 +33,19 @@ impl WorkQueue {
         let connection = self.connections.entry(connection).or_default();
         connection.workers.insert(worker_id);
         connection.n_unproven += usize::from(is_unproven);
+    }
+
+    /// Removes a worker from its connection, if it has one.
+    pub(super) fn detach(&mut self, worker_id: u64) {
+        let Some(worker) = self.workers.get_mut(&worker_id) else { return };
+        let is_unproven = worker.n_episodes == 0;
+        let Some(number) = worker.connection.take() else { return };
+        let Some(connection) = self.connections.get_mut(&number) else { return };
+        connection.workers.remove(&worker_id);
+        connection.n_unproven -= usize::from(is_unproven);
+        if connection.workers.is_empty() {
+            self.connections.remove(&number);
+        }
     }
 
     /// Returns the worker that a full queue removes for a worker whose connection has `n_unproven` others that have

@@ -17,7 +17,7 @@ pub struct Worker {
     pub slot: Option<u64>,
     /// True from its report as silent until its next call.
     pub reported_silent: bool,
-    /// The connection over which it joined, or asked for work since, while that is open.
+    /// The connection over which it joined or last asked for work, while that is open.
     pub connection: Option<u64>,
     /// The slot with which its latest report on environments arrived.
     pub reported_slot: Option<u64>,

@@ -385,8 +385,11 @@ async fn a_run_resumed_with_another_policy_of_its_teacher_is_warned_of() {
     run.stop.max_env_steps *= 2;
     let other =
         "the teacher was restarted with another policy, 0b1c0b1c0b1c instead of 5f3a5f3a5f3a, ";
-    // However often the run is resumed, the policy counts with which it began.
-    for (policy, expected) in [("0b1c", other), ("0b1c", other), ("5f3a", "")] {
+    let both = "the teacher advised by another policy for a while and has its first one, 5f3a5f3a5f3a, again: ";
+    // However often the run is resumed, the policy counts with which it began, and the run has learned from both.
+    for (policy, expected) in
+        [("5f3a", ""), ("0b1c", other), ("0b1c", other), ("5f3a", both), ("5f3a", both)]
+    {
         teacher.books().policy_digest = policy.repeat(16);
         let config = with_teacher(run.clone(), directory.path(), true, address);
         let served = Served::start(config).await;

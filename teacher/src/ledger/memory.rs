@@ -71,8 +71,12 @@ mod tests {
         let fresh = Balance { terms: TERMS, spent: 0, leased: 0, left: 10 };
         assert_eq!(ledger.open("run", TERMS).unwrap(), fresh);
         let charge = Charge { episode: 1, step: 0, wanted_in: BudgetHalves::BOTH };
-        let request =
-            ChargeRequest { account: "run".to_owned(), episode_steps: 50, charges: vec![charge] };
+        let request = ChargeRequest {
+            account: "run".to_owned(),
+            strategy: TERMS.strategy,
+            episode_steps: 50,
+            charges: vec![charge],
+        };
         assert_eq!(ledger.charge(&[request]).remove(0).unwrap().left, 9);
         assert_eq!(ledger.open("run", TERMS).unwrap(), Balance { spent: 1, left: 9, ..fresh });
     }

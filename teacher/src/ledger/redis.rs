@@ -20,8 +20,8 @@
 mod server;
 
 use super::{
-    ChargeRequest, ChargeResult, Ledger, LedgerError, OpenError, check_budget, check_terms,
-    printable, unknown_account,
+    ChargeRequest, ChargeResult, Ledger, LedgerError, OpenError, check_budget, check_strategy,
+    check_terms, printable, unknown_account,
 };
 use crate::budget::{AccountTerms, Balance, BudgetHalf, Charge, Lease};
 use crate::strategy::UnknownStrategy;
@@ -137,6 +137,7 @@ impl RedisLedger {
         reply: &Reply,
     ) -> Result<ChargeResult, LedgerError> {
         let balance = self.balance_in(&request.account, reply)?;
+        check_strategy(request, balance.terms.strategy)?;
         if let Some(charge_idx) = reply.refused.first() {
             let charge_idx = usize::try_from(*charge_idx).unwrap_or(usize::MAX);
             return Err(LedgerError::BeyondEnd { charge_idx });
@@ -152,8 +153,7 @@ impl RedisLedger {
             return Err(self.invalid("not one verdict for each charge"));
         }
         let repeated = reply.numbers.iter().map(|number| *number >= KNOWN_OFFSET).collect();
-        let Balance { terms: AccountTerms { strategy, .. }, left, .. } = balance;
-        Ok(ChargeResult { verdicts, repeated, left, strategy })
+        Ok(ChargeResult { verdicts, repeated, left: balance.left })
     }
 
     /// Returns the error for a reply or a value that no ledger writes.
@@ -239,7 +239,7 @@ fn has_written(call: &Call, reply: &Reply) -> bool {
 
 /// Encodes the arguments of `redis/charge.lua`.
 fn charge_call(request: &ChargeRequest) -> Call {
-    let mut call = Call::new(Script::Charge, &request.account);
+    let mut call = Call::new(Script::Charge, &request.account).arg(request.strategy);
     for charge in &request.charges {
         let Charge { episode, step, wanted_in } = charge;
         let digit = |yes: bool| if yes { '1' } else { '0' };

@@ -68,9 +68,8 @@ const fn kind_of(error: &Error) -> Option<FailureKind> {
         | Error::Strategy(_)
         | Error::NoValues { .. }
         | Error::Ledger(LedgerError::Budget(_) | LedgerError::BeyondEnd { .. }) => None,
-        Error::Ledger(LedgerError::Unavailable { .. }) | Error::LedgerNeedsRestart => {
-            Some(FailureKind::Ledger)
-        }
+        Error::Ledger(LedgerError::Unavailable { .. } | LedgerError::OtherStrategy { .. })
+        | Error::LedgerNeedsRestart => Some(FailureKind::Ledger),
         Error::RemotePolicy(RemoteError::Changed { .. }) => Some(FailureKind::OtherPolicy),
         Error::RemotePolicy(RemoteError::Unavailable { .. }) => Some(FailureKind::PolicyAway),
         Error::Timeout(_) => Some(FailureKind::Late),

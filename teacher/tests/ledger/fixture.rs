@@ -100,7 +100,8 @@ pub(crate) fn terms(budget: u64) -> AccountTerms {
 }
 
 pub(crate) fn request(account: &str, charges: &[Charge]) -> ChargeRequest {
-    ChargeRequest { account: account.to_owned(), episode_steps: 50, charges: charges.to_vec() }
+    let (strategy, charges) = (terms(0).strategy, charges.to_vec());
+    ChargeRequest { account: account.to_owned(), strategy, episode_steps: 50, charges }
 }
 
 pub(crate) fn charge(episode: u64, step: u32, wanted: Wanted) -> Charge {

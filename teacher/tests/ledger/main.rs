@@ -35,6 +35,7 @@ on_every_ledger! {
     semantics::an_account_is_opened_once_and_keeps_its_terms,
     semantics::an_account_that_is_not_open_is_refused_by_name,
     semantics::a_request_is_charged_as_a_whole_or_not,
+    semantics::a_request_that_another_strategy_decided_charges_nothing,
     semantics::an_episode_without_a_lease_has_no_end,
     semantics::a_repeated_operation_changes_nothing,
     semantics::leases_take_what_is_left_in_the_order_of_the_episodes,

@@ -1,7 +1,7 @@
 //! The operations of every ledger.
 
 use tandem_teacher::budget::{AccountTerms, Balance, MAX_BUDGET};
-use tandem_teacher::{Strategy, ledger::LedgerError};
+use tandem_teacher::{Strategy, ledger::ChargeRequest, ledger::LedgerError};
 
 use crate::ledger_tests::fixture::{
     BOTH, FIRST, NEITHER, NOTHING, SECOND, TestLedger, charge, inverted, lease, request, terms,
@@ -61,6 +61,28 @@ pub(crate) fn a_request_is_charged_as_a_whole_or_not(mut fixture: TestLedger) {
     // The steps of the refused request have no verdict yet.
     assert_eq!(fixture.charge("run", &[charge(1, 3, NEITHER)]), [NOTHING]);
     assert_eq!(fixture.state("run"), (3, 48, 49));
+}
+
+pub(crate) fn a_request_that_another_strategy_decided_charges_nothing(mut fixture: TestLedger) {
+    fixture.open("run", 10);
+    let strategy = Strategy::MistakeQ { threshold: 0.05 };
+    let of_another = ChargeRequest {
+        strategy,
+        ..request("run", &[charge(1, 0, NEITHER), charge(1, 1, BOTH), charge(1, 50, BOTH)])
+    };
+    let requests = [of_another, request("run", &[charge(1, 1, BOTH)])];
+    let outcomes = fixture.ledger().charge(&requests);
+    let refused = outcomes[0].as_ref().unwrap_err();
+    assert_eq!(refused.to_string(), "account \"run\" now has strategy eamc:0.1: ask again");
+    assert!(matches!(refused, LedgerError::OtherStrategy { .. }), "{refused:?}");
+    let charged = outcomes[1].as_ref().unwrap();
+    assert_eq!(
+        (charged.verdicts.as_slice(), charged.repeated.as_slice()),
+        ([FIRST].as_slice(), [false].as_slice())
+    );
+    assert_eq!(fixture.state("run"), (1, 0, 9));
+    fixture.close();
+    assert_eq!(fixture.charge("run", &[charge(1, 0, BOTH)]), [FIRST], "it has no verdict yet");
 }
 
 pub(crate) fn an_episode_without_a_lease_has_no_end(mut fixture: TestLedger) {

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use rusqlite::Connection;
 use tandem_teacher::Strategy;
-use tandem_teacher::budget::{AccountTerms, Balance, Lease};
-use tandem_teacher::ledger::{Ledger, MemoryLedger, OpenError, SqliteLedger};
+use tandem_teacher::budget::{AccountTerms, Balance, Charge, Lease};
+use tandem_teacher::ledger::{ChargeRequest, Ledger, MemoryLedger, OpenError, SqliteLedger};
 use tempfile::TempDir;
 
 use crate::ledger_tests::fixture::{BOTH, NEITHER, Verdict, charge, request, terms};
@@ -14,20 +14,26 @@ use crate::ledger_tests::fixture::{BOTH, NEITHER, Verdict, charge, request, term
 const LEASED: &str = "leased";
 const FREE: &str = "free \"quoted\"\n\u{1b}[31m";
 
+const FREE_TERMS: AccountTerms =
+    AccountTerms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
+
+fn free_request(charges: &[Charge]) -> ChargeRequest {
+    ChargeRequest { strategy: FREE_TERMS.strategy, ..request(FREE, charges) }
+}
+
 /// Repeats the operations that created `tests/data/ledger-v1.sqlite`: leases that are open, settled and exhausted,
 /// episodes without a lease, numbers beyond 2^63, steps beyond the first word, and a name with quotes and control
 /// characters.
 fn play(ledger: &mut dyn Ledger) {
     ledger.open(LEASED, terms(100)).expect("an account");
-    let free = AccountTerms { budget: 12, strategy: Strategy::MistakeQ { threshold: 0.05 } };
-    ledger.open(FREE, free).expect("an account");
+    ledger.open(FREE, FREE_TERMS).expect("an account");
     ledger.open_leases(LEASED, &[0, 1, 2, u64::MAX], 15).expect("leases");
     for step in 0..20 {
         let wanted = if step % 3 == 0 { NEITHER } else { BOTH };
         let charges =
             [charge(0, step, BOTH), charge(1, step, wanted), charge(u64::MAX, 49 - step, wanted)];
         let free = [charge(7, 5 * step, wanted), charge(1 << 63, step, BOTH)];
-        let outcomes = ledger.charge(&[request(LEASED, &charges), request(FREE, &free)]);
+        let outcomes = ledger.charge(&[request(LEASED, &charges), free_request(&free)]);
         assert!(outcomes.iter().all(Result::is_ok));
     }
     ledger.settle(LEASED, &[0, u64::MAX]).expect("settled");
@@ -46,7 +52,7 @@ fn answers_of(ledger: &mut dyn Ledger) -> (Vec<Verdict>, Vec<Lease>, [Balance; 2
         steps.map(|(episode, step)| charge(episode, step, BOTH)).collect::<Vec<_>>()
     };
     let requests =
-        [request(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), request(FREE, &steps(&[7, 1 << 63]))];
+        [request(LEASED, &steps(&[0, 1, 2, 3, u64::MAX])), free_request(&steps(&[7, 1 << 63]))];
     let results = ledger.charge(&requests).into_iter().map(|outcome| outcome.expect("paid"));
     let verdicts = results.flat_map(|result| result.verdicts).collect();
     let leases = ledger.open_leases(LEASED, &[0, 1, 2, 3, 4, u64::MAX], 15).expect("leases").0;

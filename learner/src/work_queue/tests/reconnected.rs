@@ -27,16 +27,30 @@ fn a_worker_that_calls_again_belongs_to_its_new_connection() {
     (0..2).for_each(|number| queue.push(order(number, EpisodeKind::Training)));
     let worker = queue.join("w".to_owned(), Some(7), at(0)).expect("room");
     assert_eq!(next_slot(&mut queue, worker, at(0)), Some(0));
+    // The end of the former connection is not noticed yet.
     queue.attach(worker, 8);
-    assert_eq!(queue.worker(worker).expect("known").connection, Some(7), "that is open");
-    assert_eq!(queue.remove_connection(7), [worker]);
-    queue.attach(worker, 8);
+    assert_eq!(queue.worker(worker).expect("known").connection, Some(8));
     assert_eq!(next_slot(&mut queue, worker, at(1)), Some(0));
     assert_eq!(queue.remove_connection(7), [0; 0]);
+    assert_eq!((queue.n_waiting(), queue.n_assigned()), (1, 1));
     assert_eq!(queue.remove_connection(8), [worker]);
+    // It is noticed before the worker calls again.
+    queue.attach(worker, 9);
+    assert_eq!(next_slot(&mut queue, worker, at(2)), Some(0));
+    assert_eq!(queue.remove_connection(9), [worker]);
     assert_eq!((queue.n_waiting(), queue.n_assigned()), (2, 0));
-    queue.attach(99, 8);
-    assert_eq!(queue.remove_connection(8), [0; 0], "a stranger belongs to none");
+    queue.attach(99, 9);
+    assert_eq!(queue.remove_connection(9), [0; 0], "a stranger belongs to none");
+}
+
+#[test]
+fn a_worker_that_calls_over_another_connection_frees_its_place_on_the_former_one() {
+    let (mut queue, workers) = crowded_connection();
+    assert_eq!(queue.join("w".to_owned(), Some(1), at(0)), Err(JoinError::ConnectionFull));
+    queue.attach(workers[0], 2);
+    assert!(queue.join("w".to_owned(), Some(1), at(0)).is_ok(), "there is room for one");
+    queue.attach(workers[0], 1);
+    assert_eq!(queue.worker(workers[0]).expect("known").connection, None, "there is no room");
 }
 
 #[test]

@@ -1,20 +1,25 @@
--- Makes all charges of a request, in their order, or refuses all of them. ARGV has five texts for each charge: the
--- episode, the field of its verdicts, the position of the step in it (from 1), the halves that want it, and 1 if an
--- episode with a lease has no such step.
+-- Makes all charges of a request, in their order, or refuses all of them. ARGV has the strategy by which they were
+-- decided, and five texts for each charge: the episode, the field of its verdicts, the position of the step in it (from
+-- 1), the halves that want it, and 1 if an episode with a lease has no such step.
 --
 -- The halves are two characters, for a unit of the first and of the second half: 1 if the step is worth it. A field has
 -- one character for each step: - not asked about, 0 not charged, 1 and 2 charged a unit of that half.
 --
--- Numbers: the verdicts, plus 10 if the step was asked about before. Refused: the index, from 0, of a charge beyond the end of its episode.
+-- Numbers: the verdicts, plus 10 if the step was asked about before; none if the account has another strategy.
+-- Refused: the index, from 0, of a charge beyond the end of its episode.
+
+if ARGV[1] ~= fields[2] then
+  return {balance(), {}, {}}
+end
 
 local leases = {}
-for i = 1, #ARGV, 5 do
+for i = 2, #ARGV, 5 do
   local episode = ARGV[i]
   if leases[episode] == nil then
     leases[episode] = load_lease(episode)
   end
   if ARGV[i + 4] == '1' and leases[episode] then
-    return {balance(), {}, {(i - 1) / 5}}
+    return {balance(), {}, {(i - 2) / 5}}
   end
 end
 
@@ -30,7 +35,7 @@ local function next_unit(lease)
 end
 
 local words, changed_words, changed_leases, verdicts = {}, {}, {}, {}
-for i = 1, #ARGV, 5 do
+for i = 2, #ARGV, 5 do
   local episode, field, position, wanted = ARGV[i], ARGV[i + 1], tonumber(ARGV[i + 2]), ARGV[i + 3]
   local word = words[field] or redis.call('HGET', KEYS[3], field) or ''
   local verdict = string.sub(word, position, position)

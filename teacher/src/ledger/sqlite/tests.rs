@@ -16,7 +16,8 @@ fn ledger() -> (tempfile::TempDir, SqliteLedger) {
 fn request(account: &str, episode: u64, steps: std::ops::Range<u32>) -> ChargeRequest {
     let charge = |step| Charge { episode, step, wanted_in: BudgetHalves::BOTH };
     let charges = steps.map(charge).collect();
-    ChargeRequest { account: account.to_owned(), episode_steps: 50, charges }
+    let strategy = TERMS.strategy;
+    ChargeRequest { account: account.to_owned(), strategy, episode_steps: 50, charges }
 }
 
 /// Returns the accounts in memory as text.
