@@ -364,7 +364,7 @@ fn snapshot(executor: &Executor<BoxDriver>, now_s: f64) -> Snapshot {
         motion: None,
         progress: executor.progress(),
         n_motions: 0,
-        n_good: executor.n_good(),
+        n_halts: executor.n_halts(),
         n_stops: 0,
     }
 }
