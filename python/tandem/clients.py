@@ -123,15 +123,20 @@ class _Client:
         try:
             yield
         except grpc.RpcError as error:
-            code, details = error.code().name, error.details()
-            if code == "DEADLINE_EXCEEDED":
-                details = f"no answer within {limit_s:g} s{self._connection_failure()}"
-            if code == "UNAVAILABLE":
-                details = f"{details}{self._tls_hint()}"
-            # Servers of Tandem and of Python give no other reason for a call that they do not know.
-            if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
-                details = self._wrong_service(error)
-            raise CallError(code, f"{self._address}: {details}") from error
+            raise CallError(error.code().name, f"{self._address}: {self._reason(error, limit_s)}") from error
+
+    def _reason(self, error: grpc.RpcError, limit_s: float, connection_failure: str | None = None) -> str:
+        """Returns why a call with this timeout failed. `connection_failure` is looked up unless it is known."""
+        code, details = error.code().name, error.details() or ""
+        if code == "DEADLINE_EXCEEDED":
+            failure = self._connection_failure() if connection_failure is None else connection_failure
+            return f"no answer within {limit_s:g} s{failure}"
+        if code == "UNAVAILABLE":
+            return f"{details}{self._tls_hint()}"
+        # Servers of Tandem and of Python give no other reason for a call that they do not know.
+        if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
+            return self._wrong_service(error)
+        return details
 
     def _wrong_service(self, error: grpc.RpcError) -> str:
         """Returns which service answered a call that it does not know, as far as it says so."""
@@ -400,14 +405,19 @@ class Bridge(_Client):
         """
         limit_s = min(self._timeout_s, _STOP_S)
         response: bridge_pb2.StopResponse
+        connection_failure = ""
         try:
-            response = self._stub.Stop(bridge_pb2.StopRequest(), timeout=limit_s, wait_for_ready=True)
+            call = self._stub.Stop.future(bridge_pb2.StopRequest(), timeout=limit_s, wait_for_ready=True)
+            try:
+                response = call.result(timeout=limit_s / 2)
+            except grpc.FutureTimeoutError:
+                # After the timeout of the call there would be no time left for this.
+                connection_failure = self._connection_failure()
+                response = call.result()
         except grpc.RpcError as error:
-            code, details = error.code().name, error.details()
-            if code == "DEADLINE_EXCEEDED":
-                details = f"no answer within {limit_s:g} s"
-            what = f"{self._address}: the stop is not confirmed, use the emergency stop: {details}"
-            raise CallError(code, what) from error
+            reason = self._reason(error, limit_s, connection_failure)
+            what = f"{self._address}: the stop is not confirmed, use the emergency stop: {reason}"
+            raise CallError(error.code().name, what) from error
         return response.stopped
 
     def check(self, motion: bridge_pb2.MotionRequest) -> bridge_pb2.CheckResponse:

@@ -193,6 +193,21 @@ def test_a_stop_that_is_not_confirmed_names_the_emergency_stop(monkeypatch):
     assert raised.value.code == "DEADLINE_EXCEEDED"
 
 
+def test_a_stop_without_a_bridge_gives_the_reason():
+    expected = "use the emergency stop: no answer within 0.3 s: .*Connection refused"
+    with tandem.Bridge("127.0.0.1:1", timeout_s=0.3) as bridge, pytest.raises(tandem.CallError, match=expected):
+        bridge.stop()
+
+    def act(observation, goal):
+        return np.zeros((len(observation), 3))
+
+    expected = "use the emergency stop: the service does not know the call"
+    with tandem.PolicyServer(act, task="push") as server, tandem.Bridge(server.address) as bridge:
+        with pytest.raises(tandem.CallError, match=expected) as raised:
+            bridge.stop()
+    assert raised.value.code == "UNIMPLEMENTED"
+
+
 def test_a_motion_without_reports_is_an_error(monkeypatch):
     monkeypatch.setattr(tandem.clients, "_REPORT_S", 0.2)
     with hung_bridge() as bridge, bridge.lease() as lease:
