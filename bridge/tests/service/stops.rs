@@ -220,8 +220,11 @@ async fn a_shutdown_stops_the_arms_first() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_shutdown_that_resting_arms_do_not_confirm_is_an_error() {
-    let silent = (Fault::Silent, "the arms have not confirmed it within 1s");
-    for (fault, expected) in [silent, (Fault::Dead, "could NOT be commanded to stop")] {
+    for (fault, expected) in [
+        (Fault::Silent, "the arms have not confirmed it within 1s"),
+        (Fault::Dead, "could NOT be commanded to stop"),
+        (Fault::Untrue, "the arms have confirmed the stop but are not known to rest after 1s"),
+    ] {
         let mut rig = Rig::new(patient()).await;
         rig.ready().await;
         rig.tap.fail(fault);
