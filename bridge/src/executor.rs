@@ -242,8 +242,8 @@ impl<D: Driver> Executor<D> {
         self.reset_unless_halted(token, self.n_halts, now_s)
     }
 
-    /// As [`reset`](Self::reset), unless there have been more than `n_halts` stops and faults: an operator who inspected
-    /// the arms before those has to inspect them again.
+    /// As [`reset`](Self::reset), unless there have been more than `n_halts` stops and faults: an operator has to inspect
+    /// the arms again after those.
     pub(crate) fn reset_unless_halted(
         &mut self,
         token: Token,
