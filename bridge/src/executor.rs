@@ -70,6 +70,8 @@ pub struct Executor<D: Driver> {
     answers: Answers,
     /// The newest cause of a stop after the one that stopped the arms.
     later_stop: Option<Stop>,
+    /// The number of stops and faults so far. A connection that has failed counts once.
+    n_halts: u64,
     ticked_s: Option<f64>,
     /// The error of the last attempt to stop the drives, until a command gets through.
     stop_error: Option<DriverError>,
@@ -93,6 +95,7 @@ impl<D: Driver> Executor<D> {
             commands: CommandHistory::new(&cell, &settings, period_s),
             answers: Answers::default(),
             later_stop: None,
+            n_halts: 0,
             ticked_s: None,
             stop_error: None,
             exchange_error: None,
@@ -236,10 +239,39 @@ impl<D: Driver> Executor<D> {
     /// Returns an error if the client with `token` does not own the arms, a motion is in progress, their states are not
     /// good, or they are beyond a limit at which they would be stopped again.
     pub fn reset(&mut self, token: Token, now_s: f64) -> Result<(), ResetError> {
+        self.reset_unless_halted(token, self.n_halts, now_s)
+    }
+
+    /// As [`reset`](Self::reset), unless there have been more than `n_halts` stops and faults: an operator has to inspect
+    /// the arms again after those.
+    pub(crate) fn reset_unless_halted(
+        &mut self,
+        token: Token,
+        n_halts: u64,
+        now_s: f64,
+    ) -> Result<(), ResetError> {
+        let idle = self.idle_after_reset(token, now_s);
+        let is_final = idle.as_ref().is_err_and(|refused| !refused.may_pass());
+        let was_halted = self.n_halts != n_halts && !is_final;
+        if let Some(stop) = self.newest_stop().filter(|_| was_halted) {
+            return Err(ResetError::StoppedMeanwhile { cause: stop.cause.clone() });
+        }
+        if let Some(idle) = idle? {
+            self.state = idle;
+        }
+        Ok(())
+    }
+
+    /// Returns the state of stopped arms after a reset, or `None` for arms that are idle.
+    fn idle_after_reset(
+        &mut self,
+        token: Token,
+        now_s: f64,
+    ) -> Result<Option<ArmsState>, ResetError> {
         self.renew(token, now_s)?;
         match self.phase() {
             Phase::Stopped => {}
-            Phase::Idle => return Ok(()),
+            Phase::Idle => return Ok(None),
             moving => return Err(ResetError::NotStopped(moving)),
         }
         if let Some(error) = &self.exchange_error {
@@ -265,8 +297,8 @@ impl<D: Driver> Executor<D> {
         if let Err(LocatedCause { arm, cause, .. }) = checked {
             return Err(ResetError::Limit { arm, cause });
         }
-        self.state = ArmsState::Idle { at: state.arms.iter().map(|arm| arm.angles).collect() };
-        Ok(())
+        let at = state.arms.iter().map(|arm| arm.angles).collect();
+        Ok(Some(ArmsState::Idle { at }))
     }
 
     fn too_few_states(&self, got: u32, now_s: f64) -> ResetError {
@@ -325,8 +357,8 @@ impl<D: Driver> Executor<D> {
             }
             Err(error) => {
                 self.monitor.exchange_failed();
-                self.exchange_error = Some(error.clone());
-                self.halt(StopCause::Driver(error).anywhere(), now_s);
+                self.halt(StopCause::Driver(error.clone()).anywhere(), now_s);
+                self.exchange_error = Some(error);
             }
         }
         self.phase()
@@ -407,13 +439,16 @@ impl<D: Driver> Executor<D> {
             return;
         }
         let error = DriverError::Disconnected { what: format!("no new state for {LOST_S} s") };
-        self.exchange_error = Some(error.clone());
         self.halt(StopCause::Driver(error.clone()).anywhere(), now_s);
         self.driver.disconnect(&error);
+        self.exchange_error = Some(error);
     }
 
     /// Stops the arms in the fastest way. Keeps the first cause and the newest one.
     fn halt(&mut self, cause: LocatedCause, now_s: f64) {
+        let is_counted =
+            self.exchange_error.is_some() && matches!(cause.cause, StopCause::Driver(_));
+        self.n_halts += u64::from(!is_counted);
         let stop = cause.at(now_s);
         if matches!(self.state, ArmsState::Stopped(_)) {
             self.later_stop = Some(stop);

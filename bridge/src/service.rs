@@ -34,7 +34,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::cell_file::{ArmTiming, CellFile};
-use crate::executor::{CheckedMotion, Executor, GOOD_STATES, Stop, StopCause, Token};
+use crate::executor::{CheckedMotion, Executor, Stop, StopCause, Token};
 use crate::injection::Injector;
 use messages::{decode_token, token_text};
 use metrics::StopCounter;
@@ -53,6 +53,9 @@ pub use thread::{BoxDriver, Reconnect};
 const MAX_REQUEST_BYTES: usize = 16 << 20;
 /// The longest time that a motion waits for its check.
 const CHECK_TIMEOUT: Duration = Duration::from_secs(4);
+/// The longest time that a reset waits for arms that still brake, or for good states: behind kinova-ros, these take a
+/// second.
+const RESET_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The configuration of a bridge service.
 #[derive(Clone)]
@@ -244,15 +247,38 @@ impl BridgeService {
 
     async fn reset_arms(&self, token: &str) -> Result<(), Error> {
         let token = decode_token("token", token)?;
+        let newest = self.arms.newest();
         if let Some(reconnect) = &self.config.reconnect
-            && self.arms.newest().exchange_failed
+            && newest.exchange_failed
         {
             self.replace_driver(Arc::clone(reconnect), token).await?;
         }
-        self.arms.run(move |arms, now_s| arms.executor.reset(token, now_s)).await
+        self.reset_when_ready(token, newest.n_halts).await
     }
 
-    /// Replaces a failed driver and waits for good states. The arms do not move.
+    /// Resets the arms as soon as they rest and their states are good, unless there are more than `n_halts` stops and
+    /// faults by then.
+    async fn reset_when_ready(&self, token: Token, n_halts: u64) -> Result<(), Error> {
+        let mut snapshots = self.arms.watch();
+        let timeout = tokio::time::sleep(RESET_TIMEOUT);
+        tokio::pin!(timeout);
+        loop {
+            snapshots.mark_unchanged();
+            let reset = move |arms: &mut ControlLoop, now_s| {
+                arms.executor.reset_unless_halted(token, n_halts, now_s)
+            };
+            let refused = match self.arms.run(reset).await {
+                Err(Error::Reset(refused)) if refused.may_pass() => refused,
+                ended => return ended,
+            };
+            tokio::select! {
+                changed = snapshots.changed() => changed.map_err(|_gone| Error::ShuttingDown)?,
+                () = &mut timeout => return Err(refused.into()),
+            }
+        }
+    }
+
+    /// Replaces a failed driver. The arms do not move.
     async fn replace_driver(&self, reconnect: Reconnect, token: Token) -> Result<(), Error> {
         let permit = Arc::clone(&self.reconnects).acquire_owned().await;
         let permit = permit.map_err(|_closed| Error::ShuttingDown)?;
@@ -274,7 +300,6 @@ impl BridgeService {
         };
         self.arms.run(replace).await?;
         tracing::info!("the driver was replaced");
-        self.arms.wait_until(|newest| newest.exchange_failed || newest.n_good >= GOOD_STATES).await;
         Ok(())
     }
 

@@ -12,7 +12,6 @@ import dataclasses
 import os
 import pathlib
 import threading
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, TypeVar
@@ -55,8 +54,7 @@ _STOP_S = 4.0
 _PROBE_S = 1.0
 _STEP_S = 0.04
 _RESET_S = 2.0
-"""Time for which a reset is repeated: behind kinova-ros, ten good states take a second."""
-_RESET_PAUSE_S = 0.1
+"""The longest time that a bridge waits before it refuses a reset."""
 
 _ClientT = TypeVar("_ClientT", bound="_Client")
 
@@ -115,24 +113,30 @@ class _Client:
     ) -> None:
         self.close()
 
-    def _call(self, method: Any, request: Any) -> Any:
-        with self._errors():
-            return method(request, timeout=self._timeout_s, wait_for_ready=True)
+    def _call(self, method: Any, request: Any, limit_s: float | None = None) -> Any:
+        limit_s = limit_s or self._timeout_s
+        with self._errors(limit_s):
+            return method(request, timeout=limit_s, wait_for_ready=True)
 
     @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
+    def _errors(self, limit_s: float) -> Iterator[None]:
         try:
             yield
         except grpc.RpcError as error:
-            code, details = error.code().name, error.details()
-            if code == "DEADLINE_EXCEEDED":
-                details = f"no answer within {self._timeout_s:g} s{self._connection_failure()}"
-            if code == "UNAVAILABLE":
-                details = f"{details}{self._tls_hint()}"
-            # Servers of Tandem and of Python give no other reason for a call that they do not know.
-            if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
-                details = self._wrong_service(error)
-            raise CallError(code, f"{self._address}: {details}") from error
+            raise CallError(error.code().name, f"{self._address}: {self._reason(error, limit_s)}") from error
+
+    def _reason(self, error: grpc.RpcError, limit_s: float, connection_failure: str | None = None) -> str:
+        """Returns why a call with this timeout failed. `connection_failure` is looked up unless it is known."""
+        code, details = error.code().name, error.details() or ""
+        if code == "DEADLINE_EXCEEDED":
+            failure = self._connection_failure() if connection_failure is None else connection_failure
+            return f"no answer within {limit_s:g} s{failure}"
+        if code == "UNAVAILABLE":
+            return f"{details}{self._tls_hint()}"
+        # Servers of Tandem and of Python give no other reason for a call that they do not know.
+        if code == "UNIMPLEMENTED" and details in ("", "Method not found!"):
+            return self._wrong_service(error)
+        return details
 
     def _wrong_service(self, error: grpc.RpcError) -> str:
         """Returns which service answered a call that it does not know, as far as it says so."""
@@ -316,7 +320,7 @@ class Learner(_Client):
         The stream itself has no deadline: it is opened once the learner has answered, as any call, within `timeout_s`.
         """
         self.status()
-        with self._errors():
+        with self._errors(self._timeout_s):
             stream = self._stub.Watch(learner_pb2.WatchRequest())
             try:
                 for progress in stream:
@@ -401,14 +405,19 @@ class Bridge(_Client):
         """
         limit_s = min(self._timeout_s, _STOP_S)
         response: bridge_pb2.StopResponse
+        connection_failure = ""
         try:
-            response = self._stub.Stop(bridge_pb2.StopRequest(), timeout=limit_s, wait_for_ready=True)
+            call = self._stub.Stop.future(bridge_pb2.StopRequest(), timeout=limit_s, wait_for_ready=True)
+            try:
+                response = call.result(timeout=limit_s / 2)
+            except grpc.FutureTimeoutError:
+                # After the timeout of the call there would be no time left for this.
+                connection_failure = self._connection_failure()
+                response = call.result()
         except grpc.RpcError as error:
-            code, details = error.code().name, error.details()
-            if code == "DEADLINE_EXCEEDED":
-                details = f"no answer within {limit_s:g} s"
-            what = f"{self._address}: the stop is not confirmed, use the emergency stop: {details}"
-            raise CallError(code, what) from error
+            reason = self._reason(error, limit_s, connection_failure)
+            what = f"{self._address}: the stop is not confirmed, use the emergency stop: {reason}"
+            raise CallError(error.code().name, what) from error
         return response.stopped
 
     def check(self, motion: bridge_pb2.MotionRequest) -> bridge_pb2.CheckResponse:
@@ -481,18 +490,14 @@ class Lease:
     def reset(self) -> None:
         """Releases stopped arms, so that they accept motions. Inspect the arms first. Idle arms stay as they are.
 
-        A bridge that has just started, or arms that still brake, refuse a reset; it is repeated for up to two seconds.
+        The bridge waits up to two seconds for arms that still brake, and for good states.
+
+        Raises:
+          CallError: if the bridge refuses the reset. If the arms were stopped or had a fault meanwhile, inspect them
+            again.
         """
         request = bridge_pb2.ResetRequest(token=self._token)
-        deadline_s = time.monotonic() + _RESET_S
-        while True:
-            try:
-                self._bridge._call(self._bridge._stub.Reset, request)
-                return
-            except CallError as error:
-                if error.code != "FAILED_PRECONDITION" or time.monotonic() >= deadline_s:
-                    raise
-            time.sleep(_RESET_PAUSE_S)
+        self._bridge._call(self._bridge._stub.Reset, request, self._bridge._timeout_s + _RESET_S)
 
     def renew(self) -> None:
         """Renews the lease, which otherwise ends some seconds after the last request."""
@@ -532,7 +537,7 @@ class Lease:
             while not ended.wait(_KEEP_ALIVE_S):
                 yield bridge_pb2.ExecuteRequest(alive=bridge_pb2.SignOfLife())
 
-        with self._bridge._errors():
+        with self._bridge._errors(self._bridge._timeout_s):
             responses = self._bridge._stub.Execute(requests())
             limit_s = self._bridge._timeout_s  # As for any call: the bridge checks the motion first.
             try:

@@ -83,8 +83,9 @@ def test_a_run_directory_leads_to_its_learner(tmp_path):
 def unless_busy(error):
     """Raises an error of a motion that a busy machine does not explain."""
     is_stopped = isinstance(error, tandem.MotionStopped)
-    # Arms that were stopped before a motion starts refuse it.
-    if not (error.name in BUSY if is_stopped else "not idle but Stopped" in str(error)):
+    # Arms that were stopped before a motion starts refuse it, and arms that report a fault refuse a reset.
+    refusals = ("not idle but Stopped", "stopped meanwhile", "good states", "a drive reports a fault")
+    if not (error.name in BUSY if is_stopped else any(refusal in str(error) for refusal in refusals)):
         raise error
 
 
@@ -190,6 +191,21 @@ def test_a_stop_that_is_not_confirmed_names_the_emergency_stop(monkeypatch):
     with hung_bridge() as bridge, pytest.raises(tandem.CallError, match=expected) as raised:
         bridge.stop()
     assert raised.value.code == "DEADLINE_EXCEEDED"
+
+
+def test_a_stop_without_a_bridge_gives_the_reason():
+    expected = "use the emergency stop: no answer within 0.3 s: .*Connection refused"
+    with tandem.Bridge("127.0.0.1:1", timeout_s=0.3) as bridge, pytest.raises(tandem.CallError, match=expected):
+        bridge.stop()
+
+    def act(observation, goal):
+        return np.zeros((len(observation), 3))
+
+    expected = "use the emergency stop: the service does not know the call"
+    with tandem.PolicyServer(act, task="push") as server, tandem.Bridge(server.address) as bridge:
+        with pytest.raises(tandem.CallError, match=expected) as raised:
+            bridge.stop()
+    assert raised.value.code == "UNIMPLEMENTED"
 
 
 def test_a_motion_without_reports_is_an_error(monkeypatch):

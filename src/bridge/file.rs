@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 use serde_json::{Value, json};
+use tandem_kinematics::plan::MAX_WAYPOINTS;
 use tandem_kinematics::{ArmWaypoint, Waypoint};
 use tandem_proto::pb;
 use tandem_system::atomic_file;
@@ -54,6 +55,14 @@ struct FileSample {
     angles_rad: Vec<f64>,
     velocities_radps: Vec<f64>,
     opening: f64,
+}
+
+/// Returns why a bridge would refuse a motion of `n_waypoints` that [`write`] writes, or `None` if it would not.
+pub(super) fn refusal(n_waypoints: usize) -> Option<String> {
+    // Such a motion begins at the current positions of the tools.
+    let n_most = MAX_WAYPOINTS - 1;
+    (n_waypoints > n_most)
+        .then(|| format!("a motion file has at most {n_most} waypoints, this motion {n_waypoints}"))
 }
 
 /// Writes a motion file with `waypoints` and `speed`.
@@ -127,6 +136,13 @@ mod tests {
     fn parsed(text: &str) -> Result<pb::motion_request::Motion, String> {
         let file = serde_json::from_str(text).map_err(|error| error.to_string())?;
         motion(file).map_err(str::to_owned)
+    }
+
+    #[test]
+    fn a_motion_has_room_for_the_current_positions() {
+        assert_eq!(refusal(999), None);
+        let refused = refusal(1000).unwrap();
+        assert!(refused.contains("at most 999 waypoints, this motion 1000"), "{refused}");
     }
 
     #[test]

@@ -247,12 +247,17 @@ fn run(
     let rows = series.run(args.trials, |report, row| {
         let name = format!("{}-{}-{:04}", row.policy, row.mode, row.trial);
         if args.motions {
-            write_motion(
-                report,
-                series.config.speed,
-                &out.join(MOTIONS).join(format!("{name}.json")),
-            )
-            .map_err(SeriesFailed)?;
+            let path = out.join(MOTIONS).join(format!("{name}.json"));
+            match file::refusal(report.waypoints.len()) {
+                Some(refusal) => bar.suspend(|| {
+                    output::message(format_args!(
+                        "trial {}: no {}: {refusal}",
+                        row.trial,
+                        path.display()
+                    ));
+                }),
+                None => write_motion(report, series.config.speed, &path).map_err(SeriesFailed)?,
+            }
         }
         let recorded = match args.record {
             RecordName::All => true,

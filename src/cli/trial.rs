@@ -62,7 +62,7 @@ pub(crate) struct TrialArgs {
     /// Trials to record to MCAP files.
     #[arg(long, value_enum, default_value_t = RecordName::Failures)]
     pub(crate) record: RecordName,
-    /// Writes the motion of each trial to a file for `tandem bridge move`.
+    /// Writes the motion of each trial to a file for `tandem bridge move`, except those of more than 999 waypoints.
     #[arg(long)]
     pub(crate) motions: bool,
     /// Directory for trials.jsonl and the logs [default: runs/trial-TASK].

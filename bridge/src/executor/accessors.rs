@@ -28,6 +28,12 @@ impl<D: Driver> Executor<D> {
         self.stopped_by().map(|first| self.later_stop.as_ref().unwrap_or(first))
     }
 
+    /// The number of stops and faults so far. A connection that has failed counts once.
+    #[must_use]
+    pub(crate) fn n_halts(&self) -> u64 {
+        self.n_halts
+    }
+
     /// Returns true if the arms have confirmed the last order to stop with a new state.
     #[must_use]
     pub fn stop_is_confirmed(&self) -> bool {

@@ -117,7 +117,20 @@ pub enum ResetError {
     /// A joint still moves.
     #[error("the arms still move")]
     Moving,
+    /// The arms were stopped, or had a fault, after the call of the reset.
+    #[error("stopped meanwhile ({cause}): inspect the arms and reset again")]
+    StoppedMeanwhile {
+        /// The cause of the newest stop.
+        cause: StopCause,
+    },
     /// The connection works and is not replaced.
     #[error("the arms are connected: reset them")]
     Connected,
+}
+
+impl ResetError {
+    /// Returns whether a later reset may succeed although nobody acts: the arms brake, or good states still arrive.
+    pub(crate) fn may_pass(&self) -> bool {
+        matches!(self, Self::States { rejected: None, .. } | Self::Unconfirmed | Self::Moving)
+    }
 }

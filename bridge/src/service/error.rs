@@ -48,6 +48,11 @@ pub enum Error {
         "the order to stop was sent, but the arms have not confirmed it within {0:?}: use the emergency stop"
     )]
     StopUnconfirmed(Duration),
+    /// The arms have confirmed the order to stop, but they move, or their states are not valid.
+    #[error(
+        "the arms have confirmed the stop but are not known to rest after {0:?}: use the emergency stop"
+    )]
+    NotAtRest(Duration),
     /// The thread that moves the arms has not answered.
     #[error("the thread that moves the arms has not answered within {0:?}: see the status")]
     Timeout(Duration),
@@ -105,7 +110,10 @@ impl From<Error> for Status {
             Error::StreamBroken(status) => Self::new(status.code(), message),
             Error::Busy => Self::resource_exhausted(message),
             Error::ShuttingDown | Error::Reconnect(_) => Self::unavailable(message),
-            Error::Timeout(_) | Error::StopFailed(_) | Error::StopUnconfirmed(_) => {
+            Error::Timeout(_)
+            | Error::StopFailed(_)
+            | Error::StopUnconfirmed(_)
+            | Error::NotAtRest(_) => {
                 tracing::error!(%error, "request failed");
                 Self::unavailable(message)
             }

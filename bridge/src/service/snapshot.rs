@@ -42,8 +42,8 @@ pub struct Snapshot {
     pub progress: Option<Progress>,
     /// The number of motions that have been started.
     pub n_motions: u64,
-    /// The number of consecutive good states.
-    pub(super) n_good: u32,
+    /// The number of stops and faults so far.
+    pub(super) n_halts: u64,
     /// The number of stops that have been carried out.
     pub(super) n_stops: u64,
 }
@@ -184,7 +184,7 @@ mod tests {
                 motion: None,
                 progress: None,
                 n_motions: 0,
-                n_good: 0,
+                n_halts: 0,
                 n_stops: 0,
             }));
         }

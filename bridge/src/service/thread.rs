@@ -139,7 +139,7 @@ impl ControlLoop {
     /// Ticks until `ends` is cancelled, and then until the arms have confirmed a stop and are at rest.
     ///
     /// # Errors
-    /// Returns an error if they do not confirm it in time.
+    /// Returns an error if they do not confirm it or do not come to rest in time.
     fn run(&mut self, clock: &dyn Clock, ends: &CancellationToken) -> Result<(), Error> {
         let (mut at_s, mut n_shutdown) = (clock.now_s(), 0);
         loop {
@@ -154,7 +154,7 @@ impl ControlLoop {
                 } else if self.executor.at_rest() && self.executor.stop_is_confirmed() {
                     return Ok(());
                 } else if n_shutdown == SHUTDOWN_TICKS {
-                    return Err(self.unconfirmed());
+                    return Err(self.not_stopped());
                 }
                 n_shutdown += 1;
             }
@@ -165,13 +165,17 @@ impl ControlLoop {
         }
     }
 
-    /// Returns the error of a shutdown that the arms have not confirmed.
-    fn unconfirmed(&self) -> Error {
+    /// Returns the error of a shutdown after which the arms have not confirmed the stop or are not known to rest.
+    fn not_stopped(&self) -> Error {
         if let Some(error) = self.executor.stop_error() {
             return Error::StopFailed(error.clone());
         }
         let waited_s = f64::from(SHUTDOWN_TICKS) * self.executor.period_s();
-        Error::StopUnconfirmed(Duration::from_secs_f64(waited_s))
+        let waited = Duration::from_secs_f64(waited_s);
+        match self.executor.stop_is_confirmed() {
+            true => Error::NotAtRest(waited),
+            false => Error::StopUnconfirmed(waited),
+        }
     }
 
     fn publish(&self, now_s: f64) {
@@ -364,7 +368,7 @@ fn snapshot(executor: &Executor<BoxDriver>, now_s: f64) -> Snapshot {
         motion: None,
         progress: executor.progress(),
         n_motions: 0,
-        n_good: executor.n_good(),
+        n_halts: executor.n_halts(),
         n_stops: 0,
     }
 }

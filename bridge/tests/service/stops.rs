@@ -3,7 +3,8 @@
 use tandem_bridge::service::Error;
 use tandem_bridge::{Command, Order, Settings};
 use tandem_proto::pb;
-use tonic::Code;
+use tokio::task::JoinHandle;
+use tonic::{Code, Status};
 
 use crate::service::rig::{Fault, Rig, UP_M, patient, request, slow, through};
 
@@ -219,8 +220,11 @@ async fn a_shutdown_stops_the_arms_first() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_shutdown_that_resting_arms_do_not_confirm_is_an_error() {
-    let silent = (Fault::Silent, "the arms have not confirmed it within 1s");
-    for (fault, expected) in [silent, (Fault::Dead, "could NOT be commanded to stop")] {
+    for (fault, expected) in [
+        (Fault::Silent, "the arms have not confirmed it within 1s"),
+        (Fault::Dead, "could NOT be commanded to stop"),
+        (Fault::Untrue, "the arms have confirmed the stop but are not known to rest after 1s"),
+    ] {
         let mut rig = Rig::new(patient()).await;
         rig.ready().await;
         rig.tap.fail(fault);
@@ -248,6 +252,63 @@ async fn a_driver_that_fails_stops_the_arms() {
     rig.tap.fail(Fault::None);
     rig.client.release(pb::ReleaseRequest { token }).await.unwrap();
     assert_stopped_until_reset(&mut rig, "driver").await;
+}
+
+/// Stops the arms, lets them report that a joint turns, and begins a reset, which waits for them.
+async fn begin_reset(rig: &mut Rig, token: &str) -> JoinHandle<Result<(), Status>> {
+    rig.client.stop(pb::StopRequest {}).await.unwrap();
+    rig.tap.fail(Fault::Restless);
+    let since_s = rig.status().await.now_s;
+    let is_later = |status: &pb::BridgeStatusResponse| status.now_s > since_s + 10.0;
+    let before = rig.eventually(|status| is_later(status) && !status.at_rest).await;
+    let (mut client, token) = (rig.client.clone(), token.to_owned());
+    let reset = async move { client.reset(pb::ResetRequest { token }).await.map(|_| ()) };
+    let resetting = tokio::spawn(reset);
+    // The reset renews the lease.
+    rig.eventually(|status| status.lease_left_s > before.lease_left_s).await;
+    resetting
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_reset_waits_until_the_arms_rest() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let resetting = begin_reset(&mut rig, &token).await;
+    rig.tap.fail(Fault::None);
+    resetting.await.unwrap().unwrap();
+    rig.eventually(|status| status.phase() == pb::BridgePhase::Idle).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_while_a_reset_waits_is_not_reset() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let resetting = begin_reset(&mut rig, &token).await;
+    rig.stranger().await.stop(pb::StopRequest {}).await.unwrap();
+    rig.tap.fail(Fault::None);
+    let refused = resetting.await.unwrap().unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    let expected = "stopped meanwhile (a client stopped the arms): inspect the arms";
+    assert!(refused.message().contains(expected), "{refused}");
+    rig.assert_nothing_moves().await;
+    assert_eq!(rig.status().await.phase(), pb::BridgePhase::Stopped);
+    rig.reset(&token).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_fault_that_ends_while_a_reset_waits_is_not_reset() {
+    let mut rig = Rig::new(patient()).await;
+    let token = rig.ready().await;
+    let resetting = begin_reset(&mut rig, &token).await;
+    rig.tap.fail(Fault::Untrue);
+    rig.eventually(|status| status.arms.is_empty()).await;
+    rig.tap.fail(Fault::None);
+    let refused = resetting.await.unwrap().unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains("a number of the state is not finite"), "{refused}");
+    rig.assert_nothing_moves().await;
+    assert_eq!(rig.status().await.phase(), pb::BridgePhase::Stopped);
+    rig.reset(&token).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

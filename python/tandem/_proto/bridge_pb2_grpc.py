@@ -118,7 +118,8 @@ class BridgeServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Reset(self, request, context):
-        """Releases stopped arms, so that they accept motions again. Requires the lease.
+        """Releases stopped arms, so that they accept motions again. Requires the lease. Waits up to two seconds for arms that
+        brake and for good states. A stop or fault after the call is not reset.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -77,7 +77,7 @@ struct LoopState {
     parked: Vec<bool>,
     /// The number of times that an arm has waited for its turn.
     n_waits: usize,
-    /// The generator of the noise in the actions, after the first episode.
+    /// The generator of the noise in the actions, once they have noise.
     noise: Option<ChaCha8Rng>,
     /// The waypoints of the tools so far.
     waypoints: Vec<Waypoint>,

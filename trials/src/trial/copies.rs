@@ -85,6 +85,7 @@ impl TrialRunner {
             motion,
             rehearsed_m: self.goal_distances_m(&ends, start),
             n_steps: execution.n_steps,
+            timed_out: execution.timed_out,
         })
     }
 
@@ -148,7 +149,8 @@ mod tests {
         let waypoints = vec![tools(&start.hands), tools(&raised)];
         let joint_angles = start_angles(&runner.mapping, &start).unwrap();
         let (waypoints, motion) = runner.blind_motion(waypoints, &joint_angles);
-        let idle = PlannedMotion { waypoints, motion, rehearsed_m: vec![0.0; 2], n_steps: 1 };
+        let (rehearsed_m, n_steps, timed_out) = (vec![0.0; 2], 1, false);
+        let idle = PlannedMotion { waypoints, motion, rehearsed_m, n_steps, timed_out };
         let n_failed = |start, max_failed| {
             runner.n_failed_copies(start, &joint_angles, &idle, max_failed).unwrap()
         };

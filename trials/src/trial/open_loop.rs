@@ -37,6 +37,8 @@ pub(super) struct PlannedMotion {
     /// The final distances of the objects from their goals in the rehearsal, metres.
     pub(super) rehearsed_m: Vec<f64>,
     pub(super) n_steps: usize,
+    /// Whether the time limit has passed in the rehearsal.
+    pub(super) timed_out: bool,
 }
 
 /// A motion that may be executed.
@@ -152,6 +154,7 @@ impl TrialRunner {
             motion,
             rehearsed_m: rollout.goal_distances_m.clone(),
             n_steps: rollout.steps.len(),
+            timed_out: false,
         }
     }
 
@@ -162,7 +165,7 @@ impl TrialRunner {
         start: &TrialStart,
         planned: PlannedMotion,
     ) -> TrialExecution {
-        let PlannedMotion { waypoints, motion, rehearsed_m, n_steps } = planned;
+        let PlannedMotion { waypoints, motion, rehearsed_m, n_steps, timed_out } = planned;
         let ended = motion.and_then(|motion| rig.play(motion, self.config.speed));
         let mut n_in_success = 0;
         let n_judged = self.task.success_steps();
@@ -179,7 +182,7 @@ impl TrialRunner {
             n_steps,
             n_shortened: 0,
             rehearsed_m: Some(rehearsed_m),
-            timed_out: false,
+            timed_out,
             waypoints,
         }
     }
@@ -293,6 +296,7 @@ mod tests {
             motion: Err(FailureCause::TimedOut),
             rehearsed_m: Vec::new(),
             n_steps: 0,
+            timed_out: false,
         };
         let best = |n_failed_copies, n_failed_variants| Candidate {
             n_failed_copies,

@@ -2,7 +2,8 @@
 //!
 //! A policy that has not succeeded by the end of its episode plays another one, from a start like those that it was
 //! trained with. Its actions then have noise: a policy without noise would fail in the same way again. Arms take turns
-//! if their objects could meet ([`super::order`]) or if they block each other.
+//! if their objects could meet ([`super::order`]) or if they block each other. Arms that share an object play one
+//! episode; if they cannot carry out its steps, the actions of the remaining steps have noise.
 
 use glam::DVec3;
 use tandem_core::{ArmIndex, Stream, episode_rng};
@@ -16,7 +17,7 @@ use crate::trial::runner::{REST_S, TrialExecution, TrialRunner};
 
 /// A policy is done after this many consecutive observations of placed objects that stay there.
 const DONE_OBSERVATIONS: usize = 5;
-/// An arm makes way when the steps that the arms did not carry out in full outnumber the others by this many.
+/// Arms are blocked when the steps that they did not carry out in full outnumber the others by this many.
 const MAX_BLOCKED: usize = 10;
 /// Height above the table, metres, below which an object lies on it.
 const LYING_HEIGHT_M: f64 = 0.01;
@@ -59,12 +60,7 @@ impl ClosedLoop<'_, '_> {
         self.order_arms()?;
         loop {
             if self.state.n_done == DONE_OBSERVATIONS {
-                self.rig.wait(REST_S)?;
-                if shares_object
-                    || !runner
-                        .misplaced(&self.rig.observe_objects()?, start)
-                        .any(|misplaced| misplaced)
-                {
+                if self.stay_placed()? {
                     return Ok(());
                 }
                 self.state.n_done = 0;
@@ -86,8 +82,13 @@ impl ClosedLoop<'_, '_> {
             } else {
                 self.n_shortened += 1;
                 n_blocked += 1;
+                // Noise may not help either, and arms that share an object have no other episode.
+                n_in_episode += usize::from(shares_object && self.state.noise.is_some());
             }
             if shares_object {
+                if n_blocked == MAX_BLOCKED {
+                    self.begin_noise();
+                }
                 continue;
             }
             self.nudge()?;
@@ -115,6 +116,23 @@ impl ClosedLoop<'_, '_> {
         }
     }
 
+    /// Lets the objects come to rest, and returns whether they stay at their goals. An object that all arms share is
+    /// not observed again.
+    fn stay_placed(&mut self) -> Result<bool, FailureCause> {
+        self.rig.wait(REST_S)?;
+        if self.runner.task.shares_object() {
+            return Ok(true);
+        }
+        let objects = self.rig.observe_objects()?;
+        Ok(!self.runner.misplaced(&objects, self.start).any(|misplaced| misplaced))
+    }
+
+    /// Adds noise to the actions from now on.
+    fn begin_noise(&mut self) {
+        let (seed, number) = (self.runner.config.seed, self.start.number);
+        self.state.noise.get_or_insert_with(|| episode_rng(seed, number, Stream::Exploration));
+    }
+
     /// Withdraws the arms whose objects are not at their goals, and decides again which of them waits.
     fn start_next_episode(&mut self) -> Result<(), FailureCause> {
         let (runner, start) = (self.runner, self.start);
@@ -122,10 +140,9 @@ impl ClosedLoop<'_, '_> {
         let misplaced: Vec<bool> = runner.misplaced(&objects, start).collect();
         self.retreat(&misplaced)?;
         self.recall()?;
-        let (seed, state) = (runner.config.seed, &mut self.state);
-        state.parked.fill(false);
-        state.before = None;
-        state.noise.get_or_insert_with(|| episode_rng(seed, start.number, Stream::Exploration));
+        self.state.parked.fill(false);
+        self.state.before = None;
+        self.begin_noise();
         self.order_arms()
     }
 
@@ -229,7 +246,7 @@ impl TrialRunner {
 }
 
 impl LoopState {
-    /// Adds noise to the actions of episodes after the first one.
+    /// Adds noise to `action` once it has [begun](ClosedLoop::begin_noise).
     pub(super) fn explore(&mut self, action: &mut [f32]) {
         if let Some(noise) = &mut self.noise {
             add_noise(noise, action);
@@ -243,7 +260,31 @@ mod tests {
     use tandem_core::Task;
 
     use super::*;
-    use crate::trial::{TrialMode, test_config};
+    use crate::trial::rig::{Goals, TrialRig};
+    use crate::trial::runner::start_angles;
+    use crate::trial::{NoObserver, TrialMode, test_config};
+
+    #[test]
+    fn arms_that_share_an_object_and_cannot_move_play_one_episode() {
+        let config = test_config(Task::CarryBar, TrialMode::ClosedLoop, 1);
+        let mut runner = TrialRunner::new(config).unwrap();
+        let start = runner.start(0).unwrap();
+        let joint_angles = start_angles(&runner.mapping, &start).unwrap();
+        // Arms are never that far apart, so each motion is refused.
+        runner.check.arms_gap_m = 10.0;
+        runner.step_check.arms_gap_m = 10.0;
+        let pair = runner.pair(&start, &joint_angles, 0, &runner.config.simulated);
+        let (cell, mut observer) = (runner.mapping.cell().clone(), NoObserver);
+        let mut rig = TrialRig::new(cell, pair, Goals::default(), &mut observer).unwrap();
+        let mut up = |_: &[f32], _: &[f32], action: &mut [f32]| action.fill(1.0);
+        let closed_loop = ClosedLoop::new(&runner, &mut rig, &start, &joint_angles, &mut up);
+        let execution = closed_loop.run();
+        assert_eq!(execution.ended, Ok(()));
+        assert!(!execution.timed_out && execution.n_shortened >= MAX_BLOCKED);
+        let n_steps = execution.n_steps;
+        let n_most = 2 * runner.task.episode_steps() + MAX_BLOCKED;
+        assert!((runner.task.episode_steps()..=n_most).contains(&n_steps), "{n_steps} steps");
+    }
 
     #[test]
     fn parked_arms_stay_whatever_the_policy_wants() {
