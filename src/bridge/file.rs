@@ -57,7 +57,7 @@ struct FileSample {
     opening: f64,
 }
 
-/// Returns why a bridge would refuse a motion of `n_waypoints` that [`write`] writes, or `None` if it would not.
+/// Returns why a bridge would refuse a motion of `n_waypoints` that [`write()`] writes, or `None` if it would not.
 pub(super) fn refusal(n_waypoints: usize) -> Option<String> {
     // Such a motion begins at the current positions of the tools.
     let n_most = MAX_WAYPOINTS - 1;
