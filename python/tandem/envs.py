@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import operator
 from typing import Any, SupportsIndex, cast
 
@@ -125,6 +126,17 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     def dt(self) -> float:
         """Simulated time of a control step, seconds."""
         return 1 / RENDER_FPS[self._world]
+
+    @property
+    def tandem_task(self) -> dict[str, Any]:
+        """Arguments of `tandem.serve` that describe the task, so that a server has the built-in one. Needs gRPC."""
+        from tandem._task import Task
+
+        task = Task.built_in(self._task, self._n_arms)
+        of_spaces = ("n_observation", "n_goal", "n_action", "observation_bound")
+        return {
+            field.name: getattr(task, field.name) for field in dataclasses.fields(task) if field.name not in of_spaces
+        }
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
