@@ -68,6 +68,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         substeps: Resolution of the physics, 20 or 10: physics steps per control step in the classic world, a quarter
             of their number in the others.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
+        randomization: Extent to which the world varies between episodes, in [0, 1], as the setting
+            `world.randomization` of a run: size and mass of the cubes, friction, delay of the actions, errors of
+            observed positions, with which achieved goals, rewards and success are computed, and in the shared world
+            the gap of up to 2 cm below which two arms count as touching. 0 disables it, 1 uses the full ranges.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
@@ -83,6 +87,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         world: str = "shared",
         substeps: int = 20,
         grasped_start_prob: float = 0.0,
+        randomization: float = 0.0,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 400,
@@ -94,6 +99,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
             self._n_arms,
             substeps=substeps,
             grasped_start_prob=grasped_start_prob,
+            randomization=randomization,
         )
         self.metadata = {**type(self).metadata, "render_fps": RENDER_FPS[world]}
         self.render_mode = render_mode

@@ -102,3 +102,34 @@ def test_a_shipped_policy_is_evaluated_in_a_served_environment(tmp_path):
         successes.append(info["is_success"])
     assert answer["success"] == pytest.approx(np.mean(successes))
     assert answer["mean_return"] == pytest.approx(np.mean(returns))
+
+
+def rows(data, n):
+    return np.frombuffer(data, "<f4").reshape(n, -1)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_an_episode_has_the_bits_of_tandem_env_in_worlds_that_vary_too(env_id, rng):
+    starts = [(0.0, 3), (0.25, 3), (1.0, 3), (1.0, 4)]
+    envs = [gymnasium.make(env_id, randomization=randomization) for randomization, _ in starts]
+    n = len(envs)
+    actions = rng.uniform(-1, 1, (20, n, *envs[0].action_space.shape)).astype("<f4")
+    resets = [
+        pb.EnvironmentReset(environment=idx, seed=7, episode=number, randomization=randomization)
+        for idx, (randomization, number) in enumerate(starts)
+    ]
+    requests = [pb.PlayRequest(reset=pb.ResetEnvironments(environments=resets))]
+    requests += [pb.PlayRequest(step=pb.StepEnvironments(actions=action.tobytes())) for action in actions]
+    with tandem_env(env_id) as stub:
+        first, *answers = stub.Play(iter(requests), timeout=60)
+    observations = [env.reset(seed=7, options={"episode": number})[0] for env, (_, number) in zip(envs, starts)]
+    assert np.array_equal(rows(first.goals, n), [observation["desired_goal"] for observation in observations])
+    assert np.array_equal(rows(first.observations, n), [observation["observation"] for observation in observations])
+    for action, answer in zip(actions, answers, strict=True):
+        steps = [env.step(own) for env, own in zip(envs, action)]
+        assert np.array_equal(rows(answer.observations, n), [observation["observation"] for observation, *_ in steps])
+        infos = [info for *_, info in steps]
+        contacts = [int(info["arm_contact"]) | int(info["table_contact"]) << 1 for info in infos]
+        assert [bits & 3 for bits in answer.contacts] == contacts
+    differ = [not np.array_equal(*pair) for pair in zip(rows(first.observations, n), rows(first.observations, n)[1:])]
+    assert all(differ), "randomization and number both matter"
