@@ -220,12 +220,12 @@ fn step_s(task: &TaskSpec) -> Option<f64> {
     Some((f64::from(layout.task.world().control_step_s()) * 1e3).round() / 1e3)
 }
 
-/// Returns the settings of a built-in world that this package simulates: one that does not vary.
+/// Returns the settings of a built-in world that this package simulates.
 fn simulated_settings(metadata: &EpisodeMetadata) -> Option<WorldSettings> {
     metadata.task.as_built_in()?;
     let entry = |key: &str| metadata.world.get(key).map(String::as_str);
     let settings = WorldSettings::from_log_entries(entry).ok()?.for_kind(metadata.kind);
     let is_training = metadata.kind == EpisodeKind::Training;
     let is_removed = is_training && entry(WIDE_START_SHARE).is_some_and(|share| share != "0");
-    (settings.randomization == 0.0 && !is_removed).then_some(settings)
+    (settings.check().is_ok() && !is_removed).then_some(settings)
 }

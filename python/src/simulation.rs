@@ -35,9 +35,20 @@ pub(crate) struct Simulation {
 #[pymethods]
 impl Simulation {
     #[new]
-    #[pyo3(signature = (task, n_arms, *, substeps, grasped_start_prob))]
-    fn new(task: &str, n_arms: usize, substeps: u32, grasped_start_prob: f32) -> PyResult<Self> {
-        let settings = WorldSettings { grasped_start_prob, substeps, ..WorldSettings::default() };
+    #[pyo3(signature = (task, n_arms, *, substeps, grasped_start_prob, randomization))]
+    fn new(
+        task: &str,
+        n_arms: usize,
+        substeps: u32,
+        grasped_start_prob: f32,
+        randomization: f32,
+    ) -> PyResult<Self> {
+        let settings = WorldSettings {
+            grasped_start_prob,
+            substeps,
+            randomization,
+            ..WorldSettings::default()
+        };
         Ok(Self { episode: Episode::new(task, n_arms, settings)?, started: None })
     }
 
@@ -209,6 +220,7 @@ pub(crate) fn settings_arguments(
     let arguments = PyDict::new(py);
     arguments.set_item("substeps", settings.substeps)?;
     arguments.set_item("grasped_start_prob", settings.grasped_start_prob)?;
+    arguments.set_item("randomization", settings.randomization)?;
     Ok(arguments)
 }
 

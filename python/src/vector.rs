@@ -69,7 +69,7 @@ pub(crate) struct VectorSimulation {
 #[pymethods]
 impl VectorSimulation {
     #[new]
-    #[pyo3(signature = (task, n_arms, num_envs, *, substeps, grasped_start_prob, max_episode_steps, autoreset, num_threads))]
+    #[pyo3(signature = (task, n_arms, num_envs, *, substeps, grasped_start_prob, randomization, max_episode_steps, autoreset, num_threads))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments in Python")]
     fn new(
         task: &str,
@@ -77,6 +77,7 @@ impl VectorSimulation {
         num_envs: usize,
         substeps: u32,
         grasped_start_prob: f32,
+        randomization: f32,
         max_episode_steps: u32,
         autoreset: &str,
         num_threads: usize,
@@ -87,7 +88,12 @@ impl VectorSimulation {
             "disabled" => Autoreset::Disabled,
             other => return Err(value_error(format!("unknown autoreset mode {other:?}"))),
         };
-        let settings = WorldSettings { grasped_start_prob, substeps, ..WorldSettings::default() };
+        let settings = WorldSettings {
+            grasped_start_prob,
+            substeps,
+            randomization,
+            ..WorldSettings::default()
+        };
         let slot = Slot {
             episode: Episode::new(task, n_arms, settings)?,
             seed: 0,

@@ -43,6 +43,7 @@ class TaskOptions:
     tolerance: float | None = None
     norm: Norm | None = None
     episode_steps: int | None = None
+    goal_bound: Sequence[float] | None = None
     bound: float = DEFAULT_BOUND
 
     @classmethod
@@ -100,6 +101,7 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         with_goal = (tuple(arm.observation) + tuple(n_own + goal for goal in arm.goal) for arm in arms)
         arms = tuple(dataclasses.replace(arm, observation=own) for arm, own in zip(arms, with_goal))
     bounds = _bounds(spaces["observation"], options.bound)
+    goal_bound = _bounds(spaces["desired_goal"], options.bound) if options.goal_bound is None else options.goal_bound
     if found is None:
         bounds += _bounds(spaces["achieved_goal"], options.bound)
     task = Task(
@@ -115,7 +117,7 @@ def describe(env: gymnasium.Env[Any, Any], options: TaskOptions) -> tuple[Task, 
         interchangeable_arms=options.interchangeable_arms,
         reports_contacts=options.reports_contacts,
         observation_bound=bounds,
-        goal_bound=_bounds(spaces["desired_goal"], options.bound),
+        goal_bound=goal_bound,
         origin_distance=options.origin_distance,
         recombination_gap=options.recombination_gap,
         base=options.base,

@@ -351,6 +351,7 @@ class EnvironmentServer(Server):
         tolerance: float | None = None,
         norm: Norm | None = None,
         episode_steps: int | None = None,
+        goal_bound: Sequence[float] | None = None,
         bound: float | None = None,
         token_file: Path | None = None,
         tls_cert: Path | None = None,
@@ -376,6 +377,7 @@ class EnvironmentServer(Server):
             "tolerance": tolerance,
             "norm": norm,
             "episode_steps": episode_steps,
+            "goal_bound": goal_bound,
             "bound": bound,
         }
         with environment_errors(), contextlib.closing(make(env_fn)) as env:
@@ -410,7 +412,7 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
     is closed.
 
     An environment may describe itself: the arguments from `name` to `bound` default to the items of the dictionary
-    `tandem_task`, an attribute of the environment.
+    `tandem_task`, an attribute of the environment. Those of this package's simulator describe their built-in task.
 
     Arguments:
       env_fn: a function that creates a Gymnasium environment, or an id for `gymnasium.make`. The observation is a Dict
@@ -435,6 +437,7 @@ def serve(env_fn: EnvFn, *, listen: str | None = None, **options: Any) -> None:
       tolerance, norm: when a goal counts as achieved; by default `distance_threshold` of the environment, and the norm
         with which its rewards agree.
       episode_steps: control steps per episode; by default `max_episode_steps` of its spec.
+      goal_bound: the largest magnitude of each number of a desired goal; by default that of its space.
       bound: the largest magnitude of numbers for which the spaces have no bound, or 0; by default 1000.
       token_file, tls_cert, tls_key, insecure: as the options of the same names of Tandem's services.
 

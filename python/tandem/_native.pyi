@@ -19,7 +19,9 @@ class Simulation:
     n_action: int
     observation_bounds: _Floats
     goal_bounds: _Floats
-    def __new__(cls, task: str, n_arms: int, *, substeps: int, grasped_start_prob: float) -> Simulation: ...
+    def __new__(
+        cls, task: str, n_arms: int, *, substeps: int, grasped_start_prob: float, randomization: float
+    ) -> Simulation: ...
     def reset(self, seed: int, number: int) -> tuple[dict[str, _Floats], dict[str, Any]]: ...
     def step(self, action: ArrayLike) -> tuple[dict[str, _Floats], float, bool, bool, dict[str, Any]]: ...
     def step_without_physics(
@@ -37,6 +39,7 @@ class VectorSimulation:
         *,
         substeps: int,
         grasped_start_prob: float,
+        randomization: float,
         max_episode_steps: int,
         autoreset: str,
         num_threads: int,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import operator
 from typing import Any, SupportsIndex, cast
 
@@ -67,6 +68,10 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         substeps: Resolution of the physics, 20 or 10: physics steps per control step in the classic world, a quarter
             of their number in the others.
         grasped_start_prob: Probability that an episode of pick and place starts with the cubes grasped.
+        randomization: Extent to which the world varies between episodes, in [0, 1], as the setting
+            `world.randomization` of a run: size and mass of the cubes, friction, delay of the actions, errors of
+            observed positions, with which achieved goals, rewards and success are computed, and in the shared world
+            the gap of up to 2 cm below which two arms count as touching. 0 disables it, 1 uses the full ranges.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
@@ -82,6 +87,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
         world: str = "shared",
         substeps: int = 20,
         grasped_start_prob: float = 0.0,
+        randomization: float = 0.0,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 400,
@@ -93,6 +99,7 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
             self._n_arms,
             substeps=substeps,
             grasped_start_prob=grasped_start_prob,
+            randomization=randomization,
         )
         self.metadata = {**type(self).metadata, "render_fps": RENDER_FPS[world]}
         self.render_mode = render_mode
@@ -125,6 +132,17 @@ class TandemEnv(gymnasium.Env[Observation, Action]):
     def dt(self) -> float:
         """Simulated time of a control step, seconds."""
         return 1 / RENDER_FPS[self._world]
+
+    @property
+    def tandem_task(self) -> dict[str, Any]:
+        """Arguments of `tandem.serve` that describe the task, so that a server has the built-in one. Needs gRPC."""
+        from tandem._task import Task
+
+        task = Task.built_in(self._task, self._n_arms)
+        of_spaces = ("n_observation", "n_goal", "n_action", "observation_bound")
+        return {
+            field.name: getattr(task, field.name) for field in dataclasses.fields(task) if field.name not in of_spaces
+        }
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -105,7 +105,7 @@ class Episode:
     env_kwargs: dict[str, Any] | None
     """Arguments of `gymnasium.make` that give it the episode's world. After `reset(seed=episode.seed,
     options={"episode": episode.number})` it starts as the episode did, bit for bit. None for worlds that this package
-    does not have: those of other tasks, and those that vary (`world.randomization`)."""
+    does not have: those of other tasks, and some of earlier versions."""
 
     @property
     def n_steps(self) -> int:

@@ -51,6 +51,9 @@ cannot be used.""",
     parser.add_argument("--norm", choices=["euclidean", "maximum"], help="norm of that distance")
     parser.add_argument("--episode-steps", type=int, help="control steps per episode [of the environment's spec]")
     parser.add_argument(
+        "--goal-bound", type=float, nargs="+", metavar="BOUND", help="magnitude of each number of a goal [of the space]"
+    )
+    parser.add_argument(
         "--bound", type=float, help=f"magnitude of numbers without a bound [{DEFAULT_BOUND:g}]"
     )
     _add_arms(parser.add_argument_group("arms", "by default those of the environment's tandem_task, or one arm"))

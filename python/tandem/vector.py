@@ -47,6 +47,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         num_threads: Number of threads; by default one per processor, at most one per environment.
         substeps: As for `TandemEnv`.
         grasped_start_prob: As for `TandemEnv`.
+        randomization: As for `TandemEnv`.
         render_mode: `"rgb_array"` or None.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
@@ -70,6 +71,7 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         num_threads: int | None = None,
         substeps: int = 20,
         grasped_start_prob: float = 0.0,
+        randomization: float = 0.0,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 400,
@@ -87,17 +89,21 @@ class TandemVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]])
         self.render_mode = render_mode
         self._size = (width, height)
         self._mode = mode
+        world_settings: dict[str, Any] = {
+            "substeps": substeps,
+            "grasped_start_prob": grasped_start_prob,
+            "randomization": randomization,
+        }
         self._simulation = _native.VectorSimulation(
             task,
             n_arms,
             num_envs,
-            substeps=substeps,
-            grasped_start_prob=grasped_start_prob,
+            **world_settings,
             max_episode_steps=max_episode_steps,
             autoreset=_AUTORESET[mode],
             num_threads=threads,
         )
-        single = _native.Simulation(task, n_arms, substeps=substeps, grasped_start_prob=grasped_start_prob)
+        single = _native.Simulation(task, n_arms, **world_settings)
         self.single_observation_space, self.single_action_space = spaces_of(single)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

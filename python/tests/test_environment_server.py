@@ -294,6 +294,7 @@ def test_an_achieved_goal_outside_the_observation_is_appended() -> None:
         ({}, {"norm": "maximum"}, "a goal at maximum distance"),
         ({}, {"tolerance": -1.0}, "the tolerance must be a positive number"),
         ({}, {"bound": 0.0}, "the bound must be a positive number, not 0.0"),
+        ({}, {"goal_bound": (1.0,)}, "goal_bound: expected 2 numbers, got 1"),
         ({}, {"bound": float("nan")}, "the bound must be a positive number, not nan"),
         ({}, {"name": "My env"}, "'My env' is not a name"),
         ({}, {"arms": [tandem.Arm((0, 4), (0,), (0,))]}, "indices of the observation"),
@@ -517,12 +518,13 @@ def test_the_packages_own_environments_can_be_served() -> None:
 def test_an_environment_may_describe_itself() -> None:
     arms = [tandem.Arm((2, 3), (0,), (0,), position=(3,)), tandem.Arm((0, 1), (1,), (1,), position=(0,))]
     own = {"arms": arms, "name": "pair", "origin_distance": 2.0, "recombination_gap": 0.5, "bound": 50.0}
+    own["goal_bound"] = [3.0, 4.0]
     with tandem.EnvironmentServer((ID, {"tandem_task": own}), name="points", recombination_gap=0.25) as server:
         described = Client(server).stub.Describe(pb.DescribeEnvironmentRequest()).task
     task = tandem.Task.from_message(described)
     assert (task.name, task.origin_distance, task.recombination_gap) == ("points", 2.0, 0.25)
     assert [list(arm.position) for arm in task.arms] == [[3], [0]]
-    assert list(task.observation_bound) == [9.0, 50.0, 50.0, 50.0]
+    assert (list(task.observation_bound), list(task.goal_bound)) == ([9.0, 50.0, 50.0, 50.0], [3.0, 4.0])
 
 
 def test_what_arms_share_and_success_needs_is_described() -> None:

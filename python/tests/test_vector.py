@@ -38,9 +38,9 @@ def test_make_vec_uses_the_threads_of_rust():
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize("env_id", [ENV_IDS[1], ENV_IDS[2]])
 def test_gymnasiums_vector_of_single_environments_gives_the_same(env_id, mode):
-    limit = {"max_episode_steps": 6}
-    envs = gymnasium.make_vec(env_id, num_envs=3, autoreset_mode=mode, num_threads=2, **limit)
-    expected = SyncVectorEnv([lambda: gymnasium.make(env_id, **limit)] * 3, autoreset_mode=mode)
+    arguments = {"max_episode_steps": 6, "randomization": 0.5}
+    envs = gymnasium.make_vec(env_id, num_envs=3, autoreset_mode=mode, num_threads=2, **arguments)
+    expected = SyncVectorEnv([lambda: gymnasium.make(env_id, **arguments)] * 3, autoreset_mode=mode)
     envs.action_space.seed(1)
     for one, other in zip(envs.reset(seed=9), expected.reset(seed=9), strict=True):
         assert_equal(one, other)
@@ -111,6 +111,8 @@ def test_arguments_out_of_range_are_refused():
         for count in (-1, 0, 2**32, 2**64):
             with pytest.raises(ValueError, match=rf"{name} is {count}, expected 1 to 2\*\*32 - 1"):
                 tandem.TandemVectorEnv(**{"num_envs": 1, name: count})
+    with pytest.raises(ValueError, match="world.randomization is 2: expected a number in"):
+        tandem.TandemVectorEnv(1, randomization=2)
     longest = tandem.TandemVectorEnv(1, max_episode_steps=2**32 - 1, num_threads=2**32 - 1)
     assert longest.reset(seed=1)[0]["observation"].shape == (1, 56)
 
@@ -157,7 +159,8 @@ def test_every_environment_is_drawn():
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda envs: pickle.loads(pickle.dumps(envs))])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_copied_environments_continue_their_episodes_with_the_same_bits(mode, duplicate, rng):
-    envs = tandem.TandemVectorEnv(3, "push", 1, max_episode_steps=6, autoreset_mode=mode, substeps=10)
+    settings = {"substeps": 10, "randomization": 1.0}
+    envs = tandem.TandemVectorEnv(3, "push", 1, max_episode_steps=6, autoreset_mode=mode, **settings)
     for n_steps in (0, 4, 6):
         envs.reset(seed=2)
         for _ in range(n_steps):
