@@ -24,7 +24,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"((?:^<!-- example: .*? -->\n)*)^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+# A comment ends at the first "-->", so that one of an earlier block is not taken for one of this block.
+BLOCK = re.compile(r"((?:^<!-- example: (?:(?!-->).)* -->\n)*)^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(r"<!-- example: (with|needs|where) (.*?) -->")
 LISTEN = re.compile(r"--listen (\S+):(\d+)")
 TIMEOUT_S = 300
