@@ -154,6 +154,7 @@ fn every_shipped_sweep_file_is_valid() {
         ("sweep-table2", 90),
         ("sweep-table2-classic", 18),
         ("sweep-table2-copies", 6),
+        ("sweep-table2-further", 18),
         ("sweep-table2-none", 12),
         ("sweep-table2-teachers", 2),
         ("sweep-teachers", 6),
