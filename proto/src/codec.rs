@@ -163,7 +163,7 @@ mod tests {
     fn the_largest_requests_are_decoded() {
         let motion = joint_motion(60_001);
         assert_eq!(decode_request::<pb::CheckRequest>(&motion.encode_to_vec()).unwrap(), motion);
-        // Numbers are no messages, whatever their bytes are.
+        // Numbers are not read as messages, even if their bytes look like some.
         let episode = pb::Episode { observations: [0x0a, 0].repeat(100_000), ..Default::default() };
         let submission =
             pb::SubmitEpisodesRequest { episodes: vec![episode], ..Default::default() };

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import ENV_IDS, ROOT
+from evaluations import check_evaluation
 from services import program, service
 
 pytest.importorskip("grpc")
@@ -89,19 +90,7 @@ def test_a_shipped_policy_is_evaluated_in_a_served_environment(tmp_path):
     command = [program(), "eval", "--policy", str(path), *environment, "--episodes", str(n_episodes), "--seed", "5"]
     result = subprocess.run([*command, "--json"], check=True, timeout=120, cwd=tmp_path, capture_output=True, text=True)
     answer = json.loads(result.stdout)
-    policy, env = tandem.load_policy(path), gymnasium.make(TWO_ARM_PUSH)
-    returns, successes = [], []
-    for episode in range(n_episodes):
-        observation, _ = env.reset(seed=tandem.episode_seed(5, episode))
-        rewards, truncated = [], False
-        while not truncated:
-            action, _ = policy.predict(observation)
-            observation, reward, _, truncated, info = env.step(action)
-            rewards.append(reward)
-        returns.append(sum(rewards))
-        successes.append(info["is_success"])
-    assert answer["success"] == pytest.approx(np.mean(successes))
-    assert answer["mean_return"] == pytest.approx(np.mean(returns))
+    check_evaluation(answer, gymnasium.make(TWO_ARM_PUSH), tandem.load_policy(path), 5, n_episodes)
 
 
 def rows(data, n):

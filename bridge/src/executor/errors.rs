@@ -129,7 +129,7 @@ pub enum ResetError {
 }
 
 impl ResetError {
-    /// Returns whether a later reset may succeed although nobody acts: the arms brake, or good states still arrive.
+    /// Returns true if a later reset may succeed by itself: the arms brake, or too few good states have arrived so far.
     pub(crate) fn may_pass(&self) -> bool {
         matches!(self, Self::States { rejected: None, .. } | Self::Unconfirmed | Self::Moving)
     }
