@@ -15,8 +15,10 @@ mod summary;
 mod values;
 
 pub use paper_table::paper_table;
-use values::{advice_queries, advice_spent, best_success, collision_rate, env_steps, test_success};
-pub(crate) use values::{success_joint, success_without_contact, test_collision_rate};
+use values::{advice_queries, advice_spent, best_success, collision_rate, env_steps};
+pub(crate) use values::{
+    success_joint, success_without_contact, test_collision_rate, test_success,
+};
 
 /// Runs and baselines, by task and number of arms.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,6 +48,12 @@ pub struct FilmStrip {
 pub const LEGEND: &str = "IE: epochs until success is 10 % of its maximum. RT: epochs from there to 90 % of it. MSR: maximum \
      success. ELR: 90 % of MSR per epoch until it was reached. IE, RT and ELR are – if MSR is below 0.5 or a run has fewer \
      than 5 evaluations. An epoch is `rounds.per_epoch` rounds, 50 by default.";
+
+/// Explains the intervals of groups.
+pub const INTERVALS: &str = "95 % intervals: three or more runs have Student's t interval of their mean, within [0, 1]. It \
+     includes the variation between seeds, on the same goals. Fewer runs, and runs with equal rates, have Wilson's \
+     interval over the episodes of all runs, which does not include it: Student's interval of equal rates has no width, \
+     although their mean is not certain. A policy without runs has Wilson's interval, too.";
 
 /// Heads of columns that a table of few contacts lacks.
 const WITHOUT_CONTACT: &str = "without contact";
@@ -96,11 +104,15 @@ impl Comparison {
         Self { sections, films: Vec::new(), warnings }
     }
 
-    /// Formats the tables of all values as Markdown.
+    /// Formats the tables of all values as Markdown, with an explanation of the intervals if there are runs.
     #[must_use]
     pub fn markdown(&self) -> String {
         let tables = self.sections.iter().flat_map(Section::tables);
-        tables.map(|table| table.markdown()).collect::<Vec<_>>().join("\n")
+        let mut parts: Vec<String> = tables.map(|table| table.markdown()).collect();
+        if self.sections.iter().any(|section| !section.groups.is_empty()) {
+            parts.push(paragraph(INTERVALS));
+        }
+        parts.join("\n")
     }
 
     /// Returns the notes to [`Comparison::text`], for a terminal.
@@ -109,7 +121,7 @@ impl Comparison {
         let notes = "Means over runs, with the number of runs that have the value if some do not. The page has curves, \
              ranges and all intervals.";
         let legend = if self.is_in_paper() { paragraph(LEGEND) } else { String::new() };
-        format!("{}{legend}", paragraph(notes)).trim_end().to_owned()
+        format!("{}{}{legend}", paragraph(notes), paragraph(INTERVALS)).trim_end().to_owned()
     }
 
     /// Formats the means of all groups for a terminal of 80 columns, and the names of runs without an evaluation.
@@ -246,6 +258,7 @@ impl Section {
         let title = format!("{}: success of the policy alone [95 % interval]", self.setup.title());
         let header = [
             self.label_head(),
+            "runs",
             "env steps",
             "test goals",
             WITHOUT_CONTACT,
@@ -259,6 +272,7 @@ impl Section {
             let last = |run: &Run| run.last().map(|row| (row.success, row.n_episodes));
             table.rows.push(vec![
                 group.label.clone(),
+                group.runs.len().to_string(),
                 spread(&group.spread(env_steps), short_number),
                 share_spread(&group.share(test_success)),
                 share_spread(&group.share(success_without_contact)),
@@ -295,6 +309,7 @@ fn baseline_row(Baseline { label, test }: &Baseline, reports_contacts: bool) -> 
     let none = || NONE.to_owned();
     vec![
         label.clone(),
+        none(),
         none(),
         format!("{:.3} [{low:.3}, {high:.3}]", test.success),
         test.contacts.success().map_or_else(none, |(success, Wilson { low, high })| {
@@ -449,7 +464,17 @@ mod tests {
         let row = comparison.sections[0].success().rows.pop().unwrap();
         assert_eq!(
             row,
-            ["composed-teachers", "–", "0.958 [0.925, 0.977]", "–", "–", "–", "0.908", "0.175"]
+            [
+                "composed-teachers",
+                "–",
+                "–",
+                "0.958 [0.925, 0.977]",
+                "–",
+                "–",
+                "–",
+                "0.908",
+                "0.175"
+            ]
         );
         assert_eq!(
             cells(&comparison.text(), "composed-teachers"),

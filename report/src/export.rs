@@ -5,21 +5,24 @@ use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{
-    Comparison, Section, success_joint, success_without_contact, test_collision_rate,
+    Comparison, Section, success_joint, success_without_contact, test_collision_rate, test_success,
 };
 use crate::group::{MILESTONES, SeedGroup};
 use crate::measures::{CostOf, LearningMeasures, first_reaching};
 use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::spread::Spread;
+use crate::spread::{MeanInterval, Spread};
 
 /// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
 ///
-/// The columns `held_out_*` are the evaluation on test goals.
+/// The columns `held_out_*` are the evaluation on test goals. `*_seeds_low` and `*_seeds_high` are Student's interval
+/// of the mean over the runs of the line's group; they are empty for fewer than three runs.
 pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
      effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
      advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
-     held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate,advice_queries";
+     held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate,advice_queries,\
+     held_out_success_seeds_low,held_out_success_seeds_high,held_out_success_without_contact_seeds_low,\
+     held_out_success_without_contact_seeds_high";
 
 /// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
 #[must_use]
@@ -79,6 +82,10 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         number(test.and_then(|test| test.contacts.arm_contact_rate)),
         count(last.and_then(|row| row.advice_queries)),
     ]);
+    for share in [group.share(test_success), group.share(success_without_contact)] {
+        let ends = share.over_seeds.map(|MeanInterval { low, high }| (low, high)).unzip();
+        cells.extend([number(ends.0), number(ends.1)]);
+    }
     cells
 }
 
@@ -92,7 +99,8 @@ fn quoted(cell: &str) -> String {
 
 /// Returns a comparison as one JSON object: `sections`, each with `groups` and `baselines`.
 ///
-/// The key `held_out_success` is the success on test goals.
+/// The key `held_out_success` is the success on test goals. For a share, `low` and `high` are Wilson's interval over the
+/// episodes of all runs. `seeds_low` and `seeds_high` are Student's interval of the mean over three or more runs.
 #[must_use]
 pub fn json(comparison: &Comparison) -> Value {
     json!({ "sections": comparison.sections.iter().map(section_json).collect::<Vec<_>>() })
@@ -148,9 +156,7 @@ fn group_json(group: &SeedGroup) -> Value {
         "advice_queries": spread_json(&group.spread(|run| Some(run.last()?.advice_queries? as f64))),
         "last_success": share_json(group, |run| run.last().map(|row| (row.success, row.n_episodes))),
         "best_success": share_json(group, |run| run.best().map(|row| (row.success, row.n_episodes))),
-        "held_out_success": share_json(group, |run| {
-            run.test.as_ref().map(|test| (test.success, test.n_episodes))
-        }),
+        "held_out_success": share_json(group, test_success),
         "held_out_success_without_contact": share_json(group, success_without_contact),
         "held_out_collision_rate": share_json(group, test_collision_rate),
         "success_joint": spread_json(&group.spread(success_joint)),
@@ -183,11 +189,15 @@ fn spread_json(spread: &Spread) -> Value {
 }
 
 fn share_json(group: &SeedGroup, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> Value {
-    let (spread, interval) = group.share(pick);
-    let mut value = spread_json(&spread);
-    if let (Some(object), Some(Wilson { low, high })) = (value.as_object_mut(), interval) {
-        object.insert("low".to_owned(), json!(low));
-        object.insert("high".to_owned(), json!(high));
+    let share = group.share(pick);
+    let pooled = share.pooled.map(|Wilson { low, high }| [("low", low), ("high", high)]);
+    let over_seeds = share
+        .over_seeds
+        .map(|MeanInterval { low, high }| [("seeds_low", low), ("seeds_high", high)]);
+    let mut value = spread_json(&share.values);
+    if let Some(object) = value.as_object_mut() {
+        let ends = [pooled, over_seeds].into_iter().flatten().flatten();
+        object.extend(ends.map(|(key, end)| (key.to_owned(), json!(end))));
     }
     value
 }
@@ -230,7 +240,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,"
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,,,,,"
         );
         assert_eq!(lines[2].split(',').count(), n_columns);
     }
@@ -247,11 +257,9 @@ mod tests {
         assert!(group["held_out_success"].is_null());
     }
 
-    #[test]
-    fn json_has_the_contacts_and_the_joint_goal_of_the_tables() {
-        let mut compared = comparison();
-        let [tested] = &mut compared.sections[0].groups[0].runs[..] else { panic!("one run") };
-        tested.test = Some(TestEvaluation {
+    /// An evaluation in which half of 240 episodes succeeded.
+    fn half() -> TestEvaluation {
+        TestEvaluation {
             task: "push".to_owned(),
             n_arms: 2,
             n_episodes: 240,
@@ -260,7 +268,41 @@ mod tests {
             success_joint: 0.25,
             collision_rate: Some(0.125),
             contacts: ContactMetrics::default(),
-        });
+        }
+    }
+
+    #[test]
+    fn three_runs_have_an_interval_over_seeds_beside_that_over_episodes() {
+        let of_runs = |successes: &[f64]| {
+            let mut compared = comparison();
+            let runs = &mut compared.sections[0].groups[0].runs;
+            let run = runs.remove(0);
+            runs.extend(successes.iter().map(|success| Run {
+                test: Some(TestEvaluation { success: *success, ..half() }),
+                ..run.clone()
+            }));
+            compared
+        };
+        let [two, three] = [of_runs(&[0.25, 0.75]), of_runs(&[0.25, 0.5, 0.75])];
+        let group = |compared: &Comparison| json(compared)["sections"][0]["groups"][0].clone();
+        let (of_two, of_three) = (group(&two), group(&three));
+        assert!(of_two["held_out_success"].get("seeds_low").is_none(), "{of_two}");
+        assert_eq!(of_two["held_out_success"]["low"], json!(Wilson::of(240, 480).low));
+        assert_eq!(of_three["held_out_success"]["low"], json!(Wilson::of(360, 720).low));
+        assert_eq!(of_three["held_out_success"]["seeds_low"], 0.0, "clipped");
+        assert_eq!(of_three["held_out_success"]["seeds_high"], 1.0, "clipped");
+        let ends = |compared: &Comparison| {
+            let text = csv(compared);
+            text.lines().nth(1).is_some_and(|line| line.ends_with(",0,1,,"))
+        };
+        assert!(ends(&three) && !ends(&two), "{}", csv(&three));
+    }
+
+    #[test]
+    fn json_has_the_contacts_and_the_joint_goal_of_the_tables() {
+        let mut compared = comparison();
+        let [tested] = &mut compared.sections[0].groups[0].runs[..] else { panic!("one run") };
+        tested.test = Some(half());
         let value = json(&compared);
         let group = &value["sections"][0]["groups"][0];
         assert_eq!(group["held_out_collision_rate"]["mean"], 0.125);

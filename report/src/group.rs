@@ -4,7 +4,7 @@ mod labels;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use tandem_core::{Task, Wilson};
+use tandem_core::Task;
 use tandem_telemetry::MetricsRow;
 use toml::{Table, Value};
 
@@ -12,7 +12,7 @@ use crate::measures::{LearningMeasures, first_reaching};
 use crate::paper::PaperRow;
 use crate::quantity::Quantity;
 use crate::run::Run;
-use crate::spread::{Spread, pooled_interval};
+use crate::spread::{ShareSpread, Spread};
 
 /// Success rates for which reports give the cost of reaching them.
 pub const MILESTONES: [f64; 3] = [0.5, 0.9, 0.95];
@@ -241,18 +241,19 @@ impl SeedGroup {
         self.runs.iter().filter(evaluated).all(|run| run.rows.iter().any(is_known))
     }
 
-    /// Returns the spread of a share, and its 95 % interval over the episodes of all runs.
+    /// Returns the spread of a share, with its 95 % intervals.
     ///
     /// `pick` returns a run's share, in [0, 1], and the number of its episodes.
-    pub fn share(&self, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> (Spread, Option<Wilson>) {
+    pub fn share(&self, pick: impl Fn(&Run) -> Option<(f64, u64)>) -> ShareSpread {
         let picked: Vec<(f64, u64)> = self.runs.iter().filter_map(pick).collect();
-        let values: Vec<f64> = picked.iter().map(|(share, _)| *share).collect();
-        (Spread::of(&values, self.runs.len()), pooled_interval(&picked))
+        ShareSpread::of(&picked, self.runs.len())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use tandem_core::Wilson;
+
     use super::*;
 
     fn run(name: &str, settings: &str, successes: &[f64]) -> Run {
@@ -348,11 +349,11 @@ mod tests {
             run("push-ea-seed2", &settings("ea", 2, 0.98), &[0.75]),
         ])
         .remove(0);
-        let (spread, interval) =
-            group.share(|run| run.last().map(|row| (row.success, row.n_episodes)));
-        assert_eq!((spread.mean, spread.min, spread.max), (0.625, 0.5, 0.75));
-        assert_eq!(interval, Some(Wilson::of(120 + 180, 480)));
-        assert_eq!(group.share(|_| None).1, None);
+        let share = group.share(|run| run.last().map(|row| (row.success, row.n_episodes)));
+        let Spread { mean, min, max, .. } = share.values;
+        assert_eq!((mean, min, max), (0.625, 0.5, 0.75));
+        assert_eq!(share.pooled, Some(Wilson::of(120 + 180, 480)));
+        assert_eq!(group.share(|_| None).pooled, None);
     }
 
     #[test]

@@ -47,7 +47,7 @@ pub use plots::Plot;
 pub use quantity::Quantity;
 pub use run::{Configuration, Run};
 pub use run_summary::RunLength;
-pub use spread::Spread;
+pub use spread::{MeanInterval, ShareSpread, Spread};
 pub use table::Table;
 pub use test_evaluation::TestEvaluation;
 pub use trials::{PlottedTrials, TrialGroup, Trials, trial_svg};

@@ -3,7 +3,7 @@
 use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
-use crate::spread::Spread;
+use crate::spread::{ShareSpread, Spread};
 
 /// Shown for a value that does not exist.
 pub(crate) const NONE: &str = "–";
@@ -173,11 +173,11 @@ pub(crate) fn mean(spread: &Spread, format: impl Fn(f64) -> String) -> String {
     }
 }
 
-/// Formats a share like [`spread`], with the 95 % interval over the episodes of all runs.
-pub(crate) fn share_spread((values, interval): &(Spread, Option<Wilson>)) -> String {
-    let text = spread(values, |share| format!("{share:.3}"));
-    match interval {
-        Some(Wilson { low, high }) => format!("{text} [{low:.3}, {high:.3}]"),
+/// Formats a share like [`spread`], with its 95 % interval.
+pub(crate) fn share_spread(share: &ShareSpread) -> String {
+    let text = spread(&share.values, |value| format!("{value:.3}"));
+    match share.shown_interval() {
+        Some((low, high)) => format!("{text} [{low:.3}, {high:.3}]"),
         None => text,
     }
 }

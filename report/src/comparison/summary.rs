@@ -21,15 +21,15 @@ impl Section {
         let header = [label, "runs", success, "95 % interval", NO_CONTACT, "best policy"];
         let mut table = Table::new(title, &header);
         for group in &self.groups {
-            let (test, interval) = group.share(test_success);
-            let (best, _) = group.share(best_success);
+            let test = group.share(test_success);
+            let interval = test.shown_interval().map(|(low, high)| range(low, high));
             table.rows.push(vec![
                 group.label.clone(),
                 group.runs.len().to_string(),
-                mean(&test, three_digits),
-                interval.map_or_else(|| NONE.to_owned(), |it| range(it.low, it.high)),
-                mean(&group.share(success_without_contact).0, three_digits),
-                mean(&best, three_digits),
+                mean(&test.values, three_digits),
+                interval.unwrap_or_else(|| NONE.to_owned()),
+                mean(&group.share(success_without_contact).values, three_digits),
+                mean(&group.share(best_success).values, three_digits),
             ]);
         }
         table.rows.extend(self.baselines.iter().map(|Baseline { label, test }| {
@@ -95,4 +95,64 @@ impl Section {
 fn rounded(count: f64) -> String {
     let unit = if count < 10_000.0 { 1.0 } else { 100.0 };
     short_number(unit * (count / unit).round())
+}
+
+#[cfg(test)]
+mod tests {
+    use tandem_core::Wilson;
+    use tandem_telemetry::{ContactMetrics, MetricsRow};
+
+    use crate::comparison::{Comparison, INTERVALS};
+    use crate::run::Run;
+    use crate::table::paragraph;
+    use crate::test_evaluation::TestEvaluation;
+
+    /// Compares runs of one strategy with these rates of success on 240 test goals.
+    fn compared(successes: &[f64]) -> Comparison {
+        let run = |(seed, success): (u64, &f64)| Run {
+            name: format!("push-ea-seed{seed}"),
+            rows: vec![MetricsRow { env_steps: 100, n_episodes: 240, ..MetricsRow::default() }],
+            configuration: format!(
+                "task = \"push\"\narms = 2\nseed = {seed}\n[advice]\nstrategy = \"ea\""
+            )
+            .parse()
+            .ok(),
+            test: Some(TestEvaluation {
+                task: "push".to_owned(),
+                n_arms: 2,
+                n_episodes: 240,
+                success: *success,
+                interval: Wilson { low: 0.0, high: 1.0 },
+                success_joint: *success,
+                collision_rate: Some(0.0),
+                contacts: ContactMetrics::default(),
+            }),
+            ..Run::default()
+        };
+        Comparison::of((1..).zip(successes).map(run).collect(), Vec::new())
+    }
+
+    #[test]
+    fn the_interval_is_over_seeds_if_there_are_three_that_differ() {
+        let check = |successes: &[f64], cell: &str, low: f64, high: f64| {
+            let comparison = compared(successes);
+            let (text, markdown) = (comparison.text(), comparison.markdown());
+            let line = text.lines().find(|line| line.starts_with("ea ")).unwrap();
+            assert!(line.contains(&format!("  {low:.3}–{high:.3}")), "{text}");
+            let n = successes.len();
+            let row = format!("| ea | {n} | 100 | {cell} [{low:.3}, {high:.3}] |");
+            assert!(markdown.contains(&row), "{row}\n{markdown}");
+            assert!(markdown.ends_with(&format!("\n\n{}", paragraph(INTERVALS))), "{markdown}");
+            assert!(comparison.notes().contains(paragraph(INTERVALS).trim_end()));
+        };
+        let over_episodes = |n_hits: usize, n: usize| {
+            let Wilson { low, high } = Wilson::of(n_hits, n);
+            (low, high)
+        };
+        let (low, high) = over_episodes(300, 480);
+        check(&[0.5, 0.75], "0.625 (0.500–0.750)", low, high);
+        check(&[0.4, 0.5, 0.6], "0.500 (0.400–0.600)", 0.2516, 0.7484);
+        let (low, high) = over_episodes(360, 720);
+        check(&[0.5; 3], "0.500", low, high);
+    }
 }

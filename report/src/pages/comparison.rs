@@ -1,14 +1,13 @@
 //! The part of a report that compares runs.
 
-use crate::comparison::{Comparison, LEGEND, Section, paper_table};
+use crate::comparison::{Comparison, INTERVALS, LEGEND, Section, paper_table};
 use crate::html::{details, escaped, film_strip, plot_grid, titled_table};
 use crate::paper;
 use crate::plots::{ComparisonPlots, Plot, n_first_plots};
 
 /// Explains the values of the tables.
 const NOTES: &str = "Values over several runs are the mean, with the smallest and the largest below it where a table has room, \
-     and the number of runs that have the value if some do not. Intervals are Wilson's 95 % intervals over the episodes of \
-     all runs; they do not include the variation between seeds. Bands of curves are from the smallest to the largest value \
+     and the number of runs that have the value if some do not. Bands of curves are from the smallest to the largest value \
      over seeds, or the 95 % interval of a single run. Against wall time, a curve continues after the end of a run \
      with the later points of the others. The best of many evaluations is biased upwards; the evaluation on test goals \
      is not. Success without contact is that without contact between the arms.";
@@ -32,11 +31,11 @@ pub(super) fn body(comparison: &Comparison, plots: &ComparisonPlots) -> String {
     let paragraph = |text: &str| format!("<p>{}</p>", escaped(text));
     body.push_str("<h2>Notes</h2>");
     body.extend(comparison.warnings.iter().map(|warning| paragraph(warning)));
-    if !comparison.is_in_paper() {
-        body.push_str(&paragraph(NOTES));
+    let legend = comparison.is_in_paper().then_some(LEGEND);
+    body.extend(legend.into_iter().chain([NOTES, INTERVALS]).map(paragraph));
+    if legend.is_none() {
         return body;
     }
-    body.push_str(&format!("{}{}", paragraph(LEGEND), paragraph(NOTES)));
     let source = format!("<p>{}</p><p>{}</p>", escaped(PAPER_NOTES), escaped(paper::SOURCE));
     let paper = format!("{}{source}", titled_table(&paper_table()));
     body.push_str(&details("The paper's values", &paper));
