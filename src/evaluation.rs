@@ -10,10 +10,10 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tandem_core::text::counted;
 use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout, Task, TaskSpec, Wilson};
-use tandem_policy::{BlindActor, Policy};
+use tandem_policy::{Actor, BlindActor, Policy};
 use tandem_sim::WorldConfig;
 use tandem_telemetry::ContactMetrics;
-use tandem_worker::{ComposedTeachers, Evaluation, Perturbation, PerturbedActor};
+use tandem_worker::{Act, ComposedTeachers, Evaluation, Perturbation, PerturbedActor};
 
 use crate::environment_file::server_options;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -99,19 +99,43 @@ impl EvaluatedPolicy {
 
     /// Plays the episodes with these numbers, whose goals are fixed by `seed`, on all cores.
     pub(crate) fn play(&self, numbers: Range<u64>, seed: u64) -> Result<Vec<Episode>, Failed> {
-        let actor = self.policy().actor().or_exit(Exit::Data, String::new)?;
+        let (actor, layout) = (self.actor()?, self.layout());
         let world = &WorldConfig::default();
-        let layout = self.layout();
         let evaluation = Evaluation { layout, world, seed, numbers, n_threads: n_threads() };
-        let episodes = match self {
-            Self::Policy(_) => evaluation.run(|_| actor.clone()),
-            Self::Composed(..) => evaluation.run(|_| ComposedTeachers::new(actor.clone(), layout)),
+        evaluation.run(|_| actor.clone()).or_exit(Exit::Bug, String::new)
+    }
+
+    fn actor(&self) -> Result<EvaluatedActor, Failed> {
+        let of_policy = |policy: &Policy| policy.actor().or_exit(Exit::Data, String::new);
+        match self {
+            Self::Policy(policy) => of_policy(policy).map(EvaluatedActor::Policy),
             Self::Blind(policy) => {
-                let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new)?;
-                evaluation.run(|_| blind.clone())
+                let blind = BlindActor::new(policy).or_exit(Exit::Data, String::new);
+                blind.map(EvaluatedActor::Blind)
             }
-        };
-        episodes.or_exit(Exit::Bug, String::new)
+            Self::Composed(policy, layout) => {
+                let composed = ComposedTeachers::new(of_policy(policy)?, *layout);
+                Ok(EvaluatedActor::Composed(composed))
+            }
+        }
+    }
+}
+
+/// The actor of an [`EvaluatedPolicy`].
+#[derive(Debug, Clone)]
+enum EvaluatedActor {
+    Policy(Actor),
+    Blind(BlindActor),
+    Composed(ComposedTeachers<Actor>),
+}
+
+impl Act for EvaluatedActor {
+    fn act(&mut self, observations: &[f32], goals: &[f32], actions: &mut [f32]) {
+        match self {
+            Self::Policy(actor) => actor.act(observations, goals, actions),
+            Self::Blind(actor) => actor.act(observations, goals, actions),
+            Self::Composed(actor) => actor.act(observations, goals, actions),
+        }
     }
 }
 
@@ -175,22 +199,21 @@ pub(crate) fn measure(
     Ok(outcomes.result(task, digest))
 }
 
-/// Plays episodes of `policy`, a policy for `layout`, in another world or with errors, and summarizes them. `goals` is
-/// the number of episodes, and the seed of their starts and goals.
+/// Plays episodes in another world or with errors, and summarizes them. The pair of numbers is the number of episodes,
+/// and the seed of their starts and goals.
 pub(crate) fn measure_perturbed(
-    policy: &Policy,
-    layout: Layout,
+    subject: &EvaluatedPolicy,
     (world, perturbation): (&WorldConfig, Perturbation),
     (n_episodes, seed): (u64, u64),
     take: Take<'_>,
 ) -> Result<EvaluationResult, Failed> {
-    let actor = policy.actor().or_exit(Exit::Data, String::new)?;
+    let (actor, layout) = (subject.actor()?, subject.layout());
     let perturbed = |number| PerturbedActor::new(actor.clone(), layout, perturbation, seed, number);
     let outcomes = Outcomes::of_parts(n_episodes, take, &mut |numbers| {
         let evaluation = Evaluation { layout, world, seed, numbers, n_threads: n_threads() };
         evaluation.run(perturbed).or_exit(Exit::Bug, String::new)
     })?;
-    Ok(outcomes.result(layout.into(), policy.digest()))
+    Ok(outcomes.result(layout.into(), subject.policy().digest()))
 }
 
 /// The outcomes of episodes that were played, and the time that this took.

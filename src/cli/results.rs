@@ -17,6 +17,7 @@ Examples:
   tandem eval --composed-teachers policies/teacher-push.safetensors
   tandem eval --policy policies/student-push.safetensors --robustness
       # other cubes and friction, noise, delay
+  tandem eval --policy FILE --robustness --baselines
   tandem eval --policy FILE --episodes 1 --record episode.mcap
   tandem eval --policy FILE --film arms.gif             # the first episode
   tandem eval --policy FILE --film strip.png --film-outcome failure
@@ -38,9 +39,9 @@ pub(crate) struct EvalArgs {
     pub(crate) baselines: bool,
     /// Evaluates on the same starts and goals under conditions that differ from the usual ones, one at a time: other
     /// sizes and masses of the cubes, other friction, noise in the positions of the objects, late actions, and bases that
-    /// are not where they are believed to be. Starts that have no room for larger cubes are drawn again.
-    #[arg(long, requires = "policy", conflicts_with_all = [
-        "baselines", "record", "record_dir", "film", "live", "env", "env_command"])]
+    /// are not where they are believed to be. Starts that have no room for larger cubes are drawn again. --baselines adds
+    /// the baselines under the same conditions.
+    #[arg(long, conflicts_with_all = ["record", "record_dir", "film", "live", "env", "env_command"])]
     pub(crate) robustness: bool,
     /// One-arm policy of the composed teachers [default: the shipped teacher of the task].
     #[arg(long, value_name = "FILE|DIR", requires = "baselines")]

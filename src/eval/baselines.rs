@@ -21,37 +21,8 @@ impl Baselines {
 
     /// Evaluates composed teachers and the blind policy on the goals of the policy, or nothing without `--baselines`.
     pub(super) fn measure(args: &EvalArgs, subject: &EvaluatedPolicy) -> Result<Self, Failed> {
-        if !args.baselines {
-            return Ok(Self::none());
-        }
-        let EvaluatedPolicy::Policy(policy) = subject else {
-            return Err(Failed::usage("--baselines needs --policy"));
-        };
-        let layout = subject.layout();
-        if layout.n_arms < 2 {
-            return Err(Failed::usage(
-                "--baselines: the policy drives one arm, so there is no other arm to take account of",
-            ));
-        }
-        let path = match &args.teacher {
-            Some(path) => path.clone(),
-            None => policy_file::shipped_teacher(layout.task.of_one_arm().name())?,
-        };
-        let teacher = policy_file::load(&path)?;
-        let composed =
-            EvaluatedPolicy::composed(teacher, (Some(layout.task), layout.n_arms), &path)?;
-        if composed.layout() != layout {
-            return Err(Failed::usage(format!(
-                "{} is a teacher for {}, the policy is for {}",
-                path.display(),
-                composed.layout().task,
-                layout.task
-            )));
-        }
-        let blind = EvaluatedPolicy::Blind(policy.clone());
         let goals = (args.episodes, args.seed);
-        let subjects = [("composed teachers", composed), ("blind policy", blind)];
-        let results = subjects
+        let results = subjects(args, subject)?
             .into_iter()
             .map(|(name, subject)| Ok((name, measure(&subject, goals, &mut |_| {})?)));
         results.collect::<Result<_, Failed>>().map(Self)
@@ -91,8 +62,43 @@ impl Baselines {
     }
 }
 
+/// Returns composed teachers and the blind policy with their names, or nothing without `--baselines`.
+pub(super) fn subjects(
+    args: &EvalArgs,
+    subject: &EvaluatedPolicy,
+) -> Result<Vec<(&'static str, EvaluatedPolicy)>, Failed> {
+    if !args.baselines {
+        return Ok(Vec::new());
+    }
+    let EvaluatedPolicy::Policy(policy) = subject else {
+        return Err(Failed::usage("--baselines needs --policy"));
+    };
+    let layout = subject.layout();
+    if layout.n_arms < 2 {
+        return Err(Failed::usage(
+            "--baselines: the policy drives one arm, so there is no other arm to take account of",
+        ));
+    }
+    let path = match &args.teacher {
+        Some(path) => path.clone(),
+        None => policy_file::shipped_teacher(layout.task.of_one_arm().name())?,
+    };
+    let teacher = policy_file::load(&path)?;
+    let composed = EvaluatedPolicy::composed(teacher, (Some(layout.task), layout.n_arms), &path)?;
+    if composed.layout() != layout {
+        return Err(Failed::usage(format!(
+            "{} is a teacher for {}, the policy is for {}",
+            path.display(),
+            composed.layout().task,
+            layout.task
+        )));
+    }
+    let blind = EvaluatedPolicy::Blind(policy.clone());
+    Ok(vec![("composed teachers", composed), ("blind policy", blind)])
+}
+
 /// Returns a share of the evaluated episodes, if the task has it.
-type Share = fn(&EvaluationSummary) -> Option<f64>;
+pub(super) type Share = fn(&EvaluationSummary) -> Option<f64>;
 
 /// The rows of the table.
 const MEASURES: [(&str, Share); 6] = [
@@ -105,7 +111,7 @@ const MEASURES: [(&str, Share); 6] = [
 ];
 
 /// Returns the row of one share, with a cell for each policy.
-fn row(label: &str, share: Share, columns: &[(&str, &EvaluationResult)]) -> Vec<String> {
+pub(super) fn row(label: &str, share: Share, columns: &[(&str, &EvaluationResult)]) -> Vec<String> {
     let cell = |(_, result): &(&str, &EvaluationResult)| {
         share(&result.summary).map_or_else(String::new, |share| share_text(&result.summary, share))
     };

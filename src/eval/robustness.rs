@@ -7,6 +7,7 @@ use tandem_report::Table;
 use tandem_sim::WorldConfig;
 use tandem_worker::Perturbation;
 
+use super::baselines::{self, Share};
 use super::share_text;
 use crate::cli::EvalArgs;
 use crate::evaluation::{EvaluatedPolicy, EvaluationResult, measure_perturbed};
@@ -20,59 +21,90 @@ struct Condition {
     perturbation: Perturbation,
 }
 
-/// The results under all conditions. The first one has no perturbation.
+/// The results of a policy, and of its baselines if there are any, under all conditions.
 pub(super) struct Robustness {
+    task: Task,
     n_arms: usize,
-    results: Vec<(String, EvaluationResult)>,
+    /// Names of the conditions. The first one has no perturbation.
+    conditions: Vec<String>,
+    /// Results of the policy under these conditions.
+    policy: Vec<EvaluationResult>,
+    /// The same for each baseline, after its name.
+    baselines: Vec<(&'static str, Vec<EvaluationResult>)>,
 }
 
 impl Robustness {
-    /// Evaluates the policy on the same starts and goals under every condition.
+    /// Evaluates the policy and its baselines on the same starts and goals under every condition.
     pub(super) fn measure(args: &EvalArgs, subject: &EvaluatedPolicy) -> Result<Self, Failed> {
-        let EvaluatedPolicy::Policy(policy) = subject else {
-            return Err(Failed::usage("--robustness needs --policy"));
-        };
+        let baselines = baselines::subjects(args, subject)?;
         let layout = subject.layout();
         let conditions = conditions(layout.task);
-        let progress = progress(conditions.len());
-        let mut results = Vec::with_capacity(conditions.len());
-        for Condition { name, world, perturbation } in conditions {
-            progress.set_message(name.clone());
-            let goals = (args.episodes, args.seed);
-            let result =
-                measure_perturbed(policy, layout, (&world, perturbation), goals, &mut |_| {})?;
-            results.push((name, result));
-            progress.inc(1);
-        }
+        let progress = progress(conditions.len() * (1 + baselines.len()));
+        let goals = (args.episodes, args.seed);
+        let results = |subject: &EvaluatedPolicy| {
+            let results = conditions.iter().map(|Condition { name, world, perturbation }| {
+                progress.set_message(name.clone());
+                let result =
+                    measure_perturbed(subject, (world, *perturbation), goals, &mut |_| {})?;
+                progress.inc(1);
+                Ok(result)
+            });
+            results.collect::<Result<Vec<_>, Failed>>()
+        };
+        let policy = results(subject)?;
+        let baselines = baselines.iter().map(|(name, baseline)| Ok((*name, results(baseline)?)));
+        let baselines = baselines.collect::<Result<Vec<_>, Failed>>()?;
         progress.finish_and_clear();
-        Ok(Self { n_arms: layout.n_arms, results })
+        let conditions = conditions.into_iter().map(|condition| condition.name).collect();
+        Ok(Self { task: layout.task, n_arms: layout.n_arms, conditions, policy, baselines })
     }
 
-    /// Prints the table, or one JSON object with an entry `conditions`.
+    /// Prints the tables, or one JSON object.
     pub(super) fn print(&self, args: &EvalArgs) -> Result<(), Failed> {
         if args.json {
-            return output::print(self.json(args));
+            return output::print(self.json(args.seed));
         }
-        let task = self.results.first().map_or("", |(_, result)| result.task.name());
         let goals = format!("{} episodes of seed {} each", args.episodes, args.seed);
-        output::print(format_args!("{task}, {goals}"))?;
-        output::print(self.table().text().trim_end())
+        output::print(format_args!("{}, {goals}", self.task))?;
+        output::print(self.text().trim_end())
     }
 
-    fn json(&self, args: &EvalArgs) -> Value {
-        let conditions = self.results.iter().map(|(name, result)| {
+    /// Returns the results under each condition in the entry `conditions`, and those of each baseline in an entry of
+    /// `baselines` if there are any.
+    fn json(&self, seed: u64) -> Value {
+        let mut value = json!({ "seed": seed, "conditions": self.conditions_json(&self.policy) });
+        if !self.baselines.is_empty() {
+            let baselines = self.baselines.iter().map(|(name, results)| {
+                json!({ "name": name, "conditions": self.conditions_json(results) })
+            });
+            value["baselines"] = baselines.collect();
+        }
+        value
+    }
+
+    fn conditions_json(&self, results: &[EvaluationResult]) -> Value {
+        let conditions = self.conditions.iter().zip(results).map(|(name, result)| {
             let mut value = result.json();
             value["condition"] = json!(name);
             value
         });
-        json!({ "seed": args.seed, "conditions": conditions.collect::<Value>() })
+        conditions.collect()
+    }
+
+    fn text(&self) -> String {
+        if self.baselines.is_empty() {
+            return self.table().text();
+        }
+        let tables = COMPARED.map(|(title, share)| self.comparison(title, share).text());
+        tables.join("\n")
     }
 
     fn table(&self) -> Table {
         let has_other_arm = self.n_arms > 1;
         let mut header = vec!["condition".to_owned(), "success [95 % interval]".to_owned()];
         header.extend(has_other_arm.then(|| "success without contact".to_owned()));
-        let rows = self.results.iter().map(|(name, EvaluationResult { summary, .. })| {
+        let results = self.conditions.iter().zip(&self.policy);
+        let rows = results.map(|(name, EvaluationResult { summary, .. })| {
             let without_contact = summary.success_without_contact.filter(|_| has_other_arm);
             let shares = std::iter::once(summary.success).chain(without_contact);
             let cells = shares.map(|share| share_text(summary, share));
@@ -80,7 +112,31 @@ impl Robustness {
         });
         Table { title: String::new(), header, rows: rows.collect() }
     }
+
+    /// Returns the table of one share, with a column for the policy and for each baseline.
+    fn comparison(&self, title: &str, share: Share) -> Table {
+        let baselines = self.baselines.iter().map(|(name, results)| (*name, results));
+        let columns: Vec<(&str, &Vec<EvaluationResult>)> =
+            std::iter::once(("policy", &self.policy)).chain(baselines).collect();
+        let header = std::iter::once("condition").chain(columns.iter().map(|(name, _)| *name));
+        let rows = self.conditions.iter().enumerate().map(|(idx, condition)| {
+            let results: Vec<(&str, &EvaluationResult)> =
+                columns.iter().map(|(name, results)| (*name, &results[idx])).collect();
+            baselines::row(condition, share, &results)
+        });
+        Table {
+            title: format!("{title} [95 % interval]"),
+            header: header.map(str::to_owned).collect(),
+            rows: rows.collect(),
+        }
+    }
 }
+
+/// The shares that are compared with those of baselines, each in a table of its own.
+const COMPARED: [(&str, Share); 2] = [
+    ("success without contact", |summary| summary.success_without_contact),
+    ("success", |summary| Some(summary.success)),
+];
 
 /// Returns the conditions for `task`, that without a perturbation first.
 fn conditions(task: Task) -> Vec<Condition> {
@@ -143,41 +199,106 @@ fn with_friction(factor: f32) -> WorldConfig {
 }
 
 /// Returns a progress bar on standard error, hidden unless that is a terminal.
-fn progress(n_conditions: usize) -> ProgressBar {
+fn progress(n_evaluations: usize) -> ProgressBar {
     let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} {msg}");
     let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(n_conditions as u64).with_style(style)
+    ProgressBar::new(n_evaluations as u64).with_style(style)
 }
 
 #[cfg(test)]
 mod tests {
     use std::path::Path;
 
-    use tandem_core::Episode;
+    use tandem_core::{Episode, EpisodeOutcome, EvaluationSummary, Layout};
 
     use super::*;
     use crate::evaluation::measure;
     use crate::policy_file;
+
+    /// Checks that the conditions, other than the first, change the episodes of `subject`, and returns its episodes.
+    fn episodes_that_conditions_change(subject: &EvaluatedPolicy) -> Vec<Episode> {
+        let goals = (6, 3);
+        let episodes_under = |Condition { world, perturbation, .. }: &Condition| {
+            let (conditions, mut played) = ((world, *perturbation), Vec::new());
+            let mut take = |mut episodes: Vec<Episode>| played.append(&mut episodes);
+            measure_perturbed(subject, conditions, goals, &mut take).unwrap();
+            played
+        };
+        let mut expected = Vec::new();
+        measure(subject, goals, &mut |mut episodes| expected.append(&mut episodes)).unwrap();
+        let conditions = conditions(subject.layout().task);
+        assert_eq!(episodes_under(&conditions[0]), expected);
+        for condition in &conditions[1..] {
+            assert_ne!(episodes_under(condition), expected, "{} has an effect", condition.name);
+        }
+        expected
+    }
 
     #[test]
     fn without_a_perturbation_the_result_is_that_of_an_evaluation() {
         let path = Path::new("policies/student-push-classic.safetensors");
         let policy = policy_file::load(path).unwrap();
         let subject = EvaluatedPolicy::new(policy.clone(), path).unwrap();
-        let (layout, goals) = (subject.layout(), (6, 3));
-        let episodes_under = |Condition { world, perturbation, .. }: &Condition| {
-            let (conditions, mut played) = ((world, *perturbation), Vec::new());
-            let mut take = |mut episodes: Vec<Episode>| played.append(&mut episodes);
-            measure_perturbed(&policy, layout, conditions, goals, &mut take).unwrap();
-            played
+        let layout = subject.layout();
+        let path = Path::new("policies/teacher-push-classic.safetensors");
+        let teacher = policy_file::load(path).unwrap();
+        let composed = EvaluatedPolicy::composed(teacher, (None, layout.n_arms), path).unwrap();
+        let blind = EvaluatedPolicy::Blind(policy);
+        let [policy, composed, blind] =
+            [subject, composed, blind].map(|subject| episodes_that_conditions_change(&subject));
+        assert!(policy != composed && policy != blind && composed != blind);
+    }
+
+    /// Results of a policy and two baselines for push under two conditions.
+    fn robustness() -> Robustness {
+        let layout = Layout::new(Task::Push, 2);
+        let results = || {
+            let result = || EvaluationResult {
+                task: layout.into(),
+                summary: EvaluationSummary::of(&[EpisodeOutcome::of(&Episode::zeros(layout, 0))]),
+                steps_per_s: 1.0,
+                policy_digest: String::new(),
+            };
+            vec![result(), result()]
         };
-        let mut expected = Vec::new();
-        measure(&subject, goals, &mut |mut episodes| expected.append(&mut episodes)).unwrap();
-        let conditions = conditions(layout.task);
-        assert_eq!(episodes_under(&conditions[0]), expected);
-        for condition in &conditions[1..] {
-            assert_ne!(episodes_under(condition), expected, "{} has an effect", condition.name);
+        Robustness {
+            task: layout.task,
+            n_arms: layout.n_arms,
+            conditions: vec!["none".to_owned(), "noise of 1 cm in positions".to_owned()],
+            policy: results(),
+            baselines: vec![("composed teachers", results()), ("blind policy", results())],
         }
+    }
+
+    #[test]
+    fn baselines_have_lists_with_the_keys_of_the_policy() {
+        let mut robustness = robustness();
+        let value = robustness.json(3);
+        let policy = &value["conditions"];
+        assert_eq!(policy[1]["condition"], "noise of 1 cm in positions");
+        for (idx, name) in ["composed teachers", "blind policy"].into_iter().enumerate() {
+            let baseline = &value["baselines"][idx];
+            assert_eq!((&baseline["name"], &baseline["conditions"]), (&json!(name), policy));
+        }
+        robustness.baselines.clear();
+        let alone = robustness.json(3);
+        assert_eq!((&alone["conditions"], alone.get("baselines")), (policy, None));
+    }
+
+    #[test]
+    fn baselines_have_a_column_in_a_table_for_each_kind_of_success() {
+        let mut robustness = robustness();
+        let text = robustness.text();
+        let titles: Vec<&str> = text.lines().filter(|line| line.starts_with("success")).collect();
+        assert_eq!(titles, ["success without contact [95 % interval]", "success [95 % interval]"]);
+        for head in ["policy", "composed teachers", "blind policy"] {
+            let table = robustness.comparison(COMPARED[0].0, COMPARED[0].1);
+            assert!(table.header.iter().any(|other| other == head), "{head}");
+            assert!(table.rows.iter().all(|row| row.len() == 4 && row[1] == row[3]), "{text}");
+        }
+        assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
+        robustness.baselines.clear();
+        assert_eq!(robustness.text(), robustness.table().text(), "one table of the policy");
     }
 
     #[test]
