@@ -176,6 +176,8 @@ fn what_cannot_be_converted_is_refused_in_one_line() {
     refused(&[&["policy", "import", &actor][..], &bar].concat(), 64, "carry-bar takes two arms");
     refused(&["eval", "--policy", &actor], 64, "is an ONNX model: convert it with `tandem policy");
     refused(&["policy", "export", TEACHER, "--onnx", "/no/such/actor.onnx"], 64, "cannot write");
+    let twice = ["teacher", "--ledger", "memory", "--policy", &actor, "--critic", &actor];
+    refused(&twice, 64, "is not a critic");
     json(&["policy", "import", &actor, "--out", &out, "--json"]);
     refused(&["policy", "export", &out, "--critic-onnx", &critic], 64, "has no critic");
     refused(

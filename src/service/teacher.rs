@@ -115,7 +115,11 @@ pub(crate) fn teacher_failed(error: Error) -> Failed {
         E::RemotePolicy(RemoteError::Unavailable { .. }) => Exit::TryAgain,
         E::RemotePolicy(RemoteError::Address(_) | RemoteError::Refused { .. }) => Exit::Usage,
         E::LedgerNeedsRestart | E::Transport(_) | E::Thread(_) => Exit::TryAgain,
-        E::SurplusCritic => Exit::Usage,
+        // The files are intact, but the command line names the wrong ones.
+        E::NotOneArm { .. } | E::NotAnArm(_) | E::NotOneValue { .. } | E::NotACritic { .. } => {
+            Exit::Usage
+        }
+        E::SurplusCritic | E::NoValues { .. } | E::ServerConfig(_) => Exit::Usage,
         E::Panicked => Exit::Bug,
         _ => Exit::Data,
     };

@@ -118,7 +118,7 @@ fn prepare(directory: &Path) {
 
 /// Command lines, their exit codes and a part of the error message. `@name` is a prepared file or directory, `@empty/x`
 /// a path that cannot be written, `%name` a shipped policy and `BUSY` an address in use.
-const CASES: [(&str, i32, &str); 112] = [
+const CASES: [(&str, i32, &str); 113] = [
     ("", 64, "Usage"),
     ("dance", 64, "dance"),
     ("--log [[ policy show %teacher-push", 64, "[["),
@@ -199,6 +199,7 @@ const CASES: [(&str, i32, &str); 112] = [
     ("teacher", 64, "--policy"),
     ("teacher --policy @missing", 65, "missing"),
     ("teacher --policy @torn", 65, "torn"),
+    ("teacher --policy %student-push", 64, "drives 1 arm"),
     ("teacher --policy %teacher-push --listen BUSY", 75, "cannot listen"),
     ("teacher --policy %teacher-push --listen nowhere", 64, "nowhere"),
     ("learner --run @missing.toml --out @out", 64, "missing.toml"),
