@@ -32,8 +32,8 @@ pub(crate) use results::{
 };
 pub(crate) use scene::SceneArgs;
 pub(crate) use service::{
-    ClientArgs, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs, MetricsArgs,
-    RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
+    ClientArgs, DEFAULT_LISTEN, EnvArgs, EnvGuardArgs, EnvironmentArgs, LearnerArgs, ListenArgs,
+    MetricsArgs, RelayArgs, SecretArgs, TeacherArgs, WorkerArgs,
 };
 pub(crate) use task::{
     TaskName, WorldName, check_layout, check_n_arms, check_task, chosen_task, task_flags,

@@ -4,6 +4,7 @@ mod environment;
 mod learner;
 mod listen;
 mod relay;
+mod resume_command;
 mod teacher;
 mod worker;
 

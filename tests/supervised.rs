@@ -190,6 +190,46 @@ fn eventually(holds: impl Fn() -> bool) -> bool {
     })
 }
 
+/// Interrupts the learner of this command line once it listens, and returns what it has logged.
+fn interrupt(command: &str, log: &Path) -> String {
+    let program = format!("exec '{}'", env!("CARGO_BIN_EXE_tandem"));
+    let mut shell = Command::new("sh");
+    shell.args(["-c", &command.replacen("tandem", &program, 1)]).stdin(Stdio::null());
+    log_to(&mut shell, log);
+    let mut process = shell.stdout(Stdio::piped()).spawn().expect("starts");
+    let mut line = String::new();
+    let output = process.stdout.take().expect("piped");
+    BufReader::new(output).read_line(&mut line).expect("readable");
+    let is_listening = line.starts_with("listening on ");
+    if is_listening {
+        signal("-TERM", &process);
+    }
+    let ended = end_of(&mut process);
+    drop((process.kill(), process.wait()));
+    let log = fs::read_to_string(log).expect("a log");
+    assert!(is_listening, "{log}");
+    assert_eq!(ended.and_then(|ended| ended.code()), Some(130), "{log}");
+    log
+}
+
+#[test]
+fn an_interrupted_learner_prints_the_command_that_resumes_its_run() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = |name: &str| directory.path().join(name);
+    fs::write(path("run.toml"), RUN).expect("writable");
+    let (run, out) = (path("run.toml"), path("run"));
+    let start = format!("tandem learner --run {} --out {}", run.display(), out.display());
+    let resume = format!("{start} --resume --threads 1");
+    let is_printed = |log: &str| {
+        log.contains(&format!("the state after round 0 is saved. Resume with:\n  {resume}\n"))
+    };
+    let log = interrupt(&format!("{start} --threads 1"), &path("started.log"));
+    assert!(log.contains("run interrupted") && !log.contains("run finished"), "{log}");
+    assert!(is_printed(&log), "{log}");
+    let log = interrupt(&resume, &path("resumed.log"));
+    assert!(log.contains("run resumed") && is_printed(&log), "{log}");
+}
+
 #[test]
 fn the_same_command_starts_and_resumes_a_run() {
     let mut undisturbed = Supervised::start();
@@ -206,6 +246,8 @@ fn the_same_command_starts_and_resumes_a_run() {
     signal("-TERM", &run.learner);
     let interrupted = end_of(&mut run.learner).expect("it ends");
     assert_eq!(interrupted.code(), Some(130), "{}", run.logs());
+    let log = fs::read_to_string(run.directory.path().join("learner.log")).expect("a log");
+    assert!(log.contains("is saved. The same command resumes the run:\n  tandem learner"), "{log}");
     let away = run.status();
     assert_eq!(away.status.code(), Some(75), "{}", String::from_utf8_lossy(&away.stderr));
     for worker in &mut run.workers {

@@ -16,7 +16,9 @@ use tandem_core::work::{PublishedActor, SlotOrder};
 use tandem_core::{AdviceUnit, Episode, EpisodeKind, TaskSpec};
 use tandem_rl::RunConfig;
 use tandem_rl::trainer::{RoundStats, Trainer};
-use tandem_telemetry::events::{ParametersPublished, RoundFinished, RunFinished, WorkerSilent};
+use tandem_telemetry::events::{
+    ParametersPublished, RoundFinished, RunFinished, RunInterrupted, WorkerSilent,
+};
 use tokio_util::sync::CancellationToken;
 
 use crate::advice_account::{AdviceAccount, Mismatch};
@@ -96,8 +98,11 @@ pub(crate) fn run(context: Context<'_>) -> Result<RunOutcome, Error> {
 /// Reports the end of a run that has reached the limit `reason`, or was interrupted, and returns the outcome.
 fn outcome(reason: Option<String>, round: u64, digest: String) -> RunOutcome {
     let interrupted = reason.is_none();
+    match reason.as_deref() {
+        Some(reason) => RunFinished { reason, round, digest: &digest }.emit(),
+        None => RunInterrupted { round, digest: &digest }.emit(),
+    }
     let reason = reason.unwrap_or_else(|| INTERRUPTED.to_owned());
-    RunFinished { reason: &reason, round, digest: &digest }.emit();
     RunOutcome { reason, interrupted, digest }
 }
 

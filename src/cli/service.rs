@@ -10,6 +10,9 @@ use clap::Args;
 use super::monitor::seconds;
 use super::{RecordingArgs, TaskName, WorldName};
 
+/// Default address of a service: a free port.
+pub(crate) const DEFAULT_LISTEN: &str = "127.0.0.1:0";
+
 /// Access token.
 #[derive(Debug, Args)]
 pub(crate) struct SecretArgs {
@@ -22,7 +25,7 @@ pub(crate) struct SecretArgs {
 #[derive(Debug, Args)]
 pub(crate) struct ListenArgs {
     /// Address to listen on; port 0 selects a free port. The address is printed as `listening on ADDR`.
-    #[arg(long, default_value = "127.0.0.1:0", value_name = "ADDR")]
+    #[arg(long, default_value = DEFAULT_LISTEN, value_name = "ADDR")]
     pub(crate) listen: SocketAddr,
     /// Enables TLS with this certificate chain (PEM).
     #[arg(long, value_name = "FILE.pem", requires = "tls_key")]

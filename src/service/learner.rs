@@ -14,6 +14,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+use super::resume_command::interrupted;
 use super::{listen, run};
 use crate::cli::LearnerArgs;
 use crate::exit::{Exit, Failed, OrExit as _};
@@ -61,9 +62,9 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             run: run_config,
             server_config,
             client_config,
-            teacher: args.teacher,
+            teacher: args.teacher.clone(),
             start_from,
-            out: args.out,
+            out: args.out.clone(),
             resume: args.resume || args.start_or_resume,
             out_is_locked: args.out_is_locked,
             run_file,
@@ -83,7 +84,7 @@ pub(crate) fn learner(args: LearnerArgs) -> Result<(), Failed> {
             tracing::warn!(reason = %failed.line(), "the report of the run cannot be written");
         }
         match ended.interrupted {
-            true => Err(Failed::new(Exit::Interrupted, anyhow::anyhow!(ended.reason))),
+            true => Err(interrupted(&args)),
             false => Ok(()),
         }
     })

@@ -194,7 +194,7 @@ event! {
 }
 
 event! {
-    /// A run ended.
+    /// A run reached one of its limits.
     pub struct RunFinished<'a> {
         /// Reason of the end.
         pub reason: &'a str,
@@ -204,4 +204,15 @@ event! {
         pub digest: &'a str,
     }
     info!(reason, round, digest, "run finished")
+}
+
+event! {
+    /// A run was stopped before its end and can be resumed.
+    pub struct RunInterrupted<'a> {
+        /// Number of its last round.
+        pub round: u64,
+        /// SHA-256 of the learning state.
+        pub digest: &'a str,
+    }
+    info!(round, digest, "run interrupted")
 }
