@@ -113,7 +113,8 @@ impl ServerConfig {
     /// Returns the router of `service`: the service and both versions of reflection behind the token check, and health
     /// without it.
     ///
-    /// `descriptors` is the encoded `FileDescriptorSet` that reflection offers.
+    /// `descriptors` is the encoded `FileDescriptorSet` that reflection offers. Reflection lists only `service` and
+    /// health, even if the set describes more services.
     ///
     /// # Errors
     /// When the certificate or the descriptors cannot be used.
@@ -137,6 +138,8 @@ impl ServerConfig {
             tonic_reflection::server::Builder::configure()
                 .register_encoded_file_descriptor_set(descriptors)
                 .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+                .with_service_name(S::NAME)
+                .with_service_name(tonic_health::pb::health_server::SERVICE_NAME)
         };
         let token = TokenInterceptor { token: self.token.clone() };
         let methods = Methods::of(&[

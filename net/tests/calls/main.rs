@@ -65,33 +65,48 @@ async fn call_all(channel: &AuthChannel) -> Vec<(&'static str, Result<(), Status
         ("AdviseStream", streamed.await),
         ("OpenLeases", teacher.open_leases(pb::OpenLeasesRequest::default()).await.map(drop)),
         ("SettleLeases", teacher.settle_leases(pb::SettleLeasesRequest::default()).await.map(drop)),
-        ("reflection v1", reflect_v1(channel).await),
-        ("reflection v1alpha", reflect_v1alpha(channel).await),
+        ("reflection v1", reflect_v1(channel).await.map(drop)),
+        ("reflection v1alpha", reflect_v1alpha(channel).await.map(drop)),
     ]
 }
 
-async fn reflect_v1(channel: &AuthChannel) -> Result<(), Status> {
+/// Returns the services that reflection lists.
+async fn reflect_v1(channel: &AuthChannel) -> Result<Vec<String>, Status> {
     use v1::server_reflection_request::MessageRequest::ListServices;
+    use v1::server_reflection_response::MessageResponse::ListServicesResponse;
     let request = v1::ServerReflectionRequest {
         host: String::new(),
         message_request: Some(ListServices(String::new())),
     };
-    v1::server_reflection_client::ServerReflectionClient::new(channel.clone())
-        .server_reflection_info(tokio_stream::iter([request]))
-        .await
-        .map(drop)
+    let mut client = v1::server_reflection_client::ServerReflectionClient::new(channel.clone());
+    let answers = client.server_reflection_info(tokio_stream::iter([request])).await?;
+    let answer = answers.into_inner().message().await?.expect("an answer");
+    match answer.message_response {
+        Some(ListServicesResponse(listed)) => {
+            Ok(listed.service.into_iter().map(|service| service.name).collect())
+        }
+        other => Err(Status::internal(format!("not a list of services: {other:?}"))),
+    }
 }
 
-async fn reflect_v1alpha(channel: &AuthChannel) -> Result<(), Status> {
+/// Returns the services that reflection lists.
+async fn reflect_v1alpha(channel: &AuthChannel) -> Result<Vec<String>, Status> {
     use v1alpha::server_reflection_request::MessageRequest::ListServices;
+    use v1alpha::server_reflection_response::MessageResponse::ListServicesResponse;
     let request = v1alpha::ServerReflectionRequest {
         host: String::new(),
         message_request: Some(ListServices(String::new())),
     };
-    v1alpha::server_reflection_client::ServerReflectionClient::new(channel.clone())
-        .server_reflection_info(tokio_stream::iter([request]))
-        .await
-        .map(drop)
+    let mut client =
+        v1alpha::server_reflection_client::ServerReflectionClient::new(channel.clone());
+    let answers = client.server_reflection_info(tokio_stream::iter([request])).await?;
+    let answer = answers.into_inner().message().await?.expect("an answer");
+    match answer.message_response {
+        Some(ListServicesResponse(listed)) => {
+            Ok(listed.service.into_iter().map(|service| service.name).collect())
+        }
+        other => Err(Status::internal(format!("not a list of services: {other:?}"))),
+    }
 }
 
 #[tokio::test]
@@ -126,6 +141,17 @@ async fn every_call_but_health_requires_the_right_token() {
             assert!(outcome.is_ok(), "{name}: {outcome:?}");
         }
         assert_eq!(served.counter.n_calls(), 7);
+    }
+}
+
+#[tokio::test]
+async fn reflection_lists_the_services_at_the_address_only() {
+    let served = Served::start(&ServerConfig::default()).await;
+    let channel = ClientConfig::default().channel(&served.address.to_string()).expect("an address");
+    for listed in [reflect_v1(&channel).await, reflect_v1alpha(&channel).await] {
+        let mut listed = listed.expect("listed");
+        listed.sort();
+        assert_eq!(listed, ["grpc.health.v1.Health", "tandem.v1.Teacher"]);
     }
 }
 
