@@ -235,6 +235,7 @@ fn test_evaluation(subject: &EvaluatedPolicy, result: &EvaluationResult) -> Test
         success: summary.success,
         interval: summary.interval,
         success_joint: summary.success_joint,
+        success_per_arm: summary.success_per_arm.clone(),
         collision_rate: Some(summary.collision_rate),
         contacts: ContactMetrics::of(summary),
     }

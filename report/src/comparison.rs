@@ -17,7 +17,7 @@ mod values;
 pub use paper_table::paper_table;
 use values::{advice_queries, advice_spent, best_success, collision_rate, env_steps};
 pub(crate) use values::{
-    success_joint, success_without_contact, test_collision_rate, test_success,
+    success_joint, success_per_arm, success_without_contact, test_collision_rate, test_success,
 };
 
 /// Runs and baselines, by task and number of arms.
@@ -381,6 +381,7 @@ mod tests {
             success: 0.958,
             interval: Wilson { low: 0.925, high: 0.977 },
             success_joint: 0.908,
+            success_per_arm: vec![0.967, 0.971],
             collision_rate: Some(0.175),
             contacts: ContactMetrics::default(),
         };

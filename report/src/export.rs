@@ -5,7 +5,8 @@ use tandem_core::Wilson;
 use tandem_telemetry::MetricsRow;
 
 use crate::comparison::{
-    Comparison, Section, success_joint, success_without_contact, test_collision_rate, test_success,
+    Comparison, Section, success_joint, success_per_arm, success_without_contact,
+    test_collision_rate, test_success,
 };
 use crate::group::{MILESTONES, SeedGroup};
 use crate::measures::{CostOf, LearningMeasures, first_reaching};
@@ -15,14 +16,15 @@ use crate::spread::{MeanInterval, Spread};
 
 /// Header of [`csv`]. Steps are environment steps, epochs are the paper's, shares are in [0, 1].
 ///
-/// The columns `held_out_*` are the evaluation on test goals. `*_seeds_low` and `*_seeds_high` are Student's interval
-/// of the mean over the runs of the line's group; they are empty for fewer than three runs.
+/// The columns `held_out_*` are the evaluation on test goals. A list of one number per arm is separated by spaces.
+/// `*_seeds_low` and `*_seeds_high` are Student's interval of the mean over the runs of the line's group; they are
+/// empty for fewer than three runs.
 pub const CSV_HEADER: &str = "task,arms,group,strategy,run,seed,evaluations,env_steps,wall_s,inspired_epoch,rise_epochs,max_success,\
      effective_learning_rate,env_steps_to_50,env_steps_to_90,env_steps_to_95,minutes_to_50,minutes_to_90,minutes_to_95,\
      advice_spent,last_success,last_low,last_high,collision_rate,held_out_success,held_out_low,held_out_high,\
      held_out_collision_rate,held_out_success_without_contact,held_out_arm_contact_rate,advice_queries,\
-     held_out_success_seeds_low,held_out_success_seeds_high,held_out_success_without_contact_seeds_low,\
-     held_out_success_without_contact_seeds_high";
+     held_out_success_joint,held_out_success_per_arm,held_out_success_seeds_low,held_out_success_seeds_high,\
+      held_out_success_without_contact_seeds_low,held_out_success_without_contact_seeds_high";
 
 /// Returns a comparison as CSV with one line per run. Values that do not exist are empty.
 #[must_use]
@@ -46,6 +48,7 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         value.filter(|v| v.is_finite()).map(|v| v.to_string()).unwrap_or_default()
     };
     let count = |value: Option<u64>| value.map(|v| v.to_string()).unwrap_or_default();
+    let list = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let measures = LearningMeasures::for_comparison(&run.rows);
     let last = run.last();
     let test = run.test.as_ref();
@@ -81,6 +84,8 @@ fn run_cells(group: &SeedGroup, run: &Run) -> Vec<String> {
         number(test.and_then(|test| test.contacts.success_without_contact)),
         number(test.and_then(|test| test.contacts.arm_contact_rate)),
         count(last.and_then(|row| row.advice_queries)),
+        number(test.map(|test| test.success_joint)),
+        test.map(|test| list(&test.success_per_arm)).unwrap_or_default(),
     ]);
     for share in [group.share(test_success), group.share(success_without_contact)] {
         let ends = share.over_seeds.map(|MeanInterval { low, high }| (low, high)).unzip();
@@ -114,6 +119,7 @@ fn section_json(section: &Section) -> Value {
             "label": baseline.label, "episodes": test.n_episodes, "success": test.success,
             "success_low": test.interval.low, "success_high": test.interval.high,
             "success_joint": test.success_joint,
+            "success_per_arm": test.success_per_arm,
             "collision_rate": test.collision_rate.filter(|_| reports_contacts),
             "success_without_contact": test.contacts.success_without_contact,
             "success_without_contact_low": test.contacts.success_without_contact_low,
@@ -160,6 +166,7 @@ fn group_json(group: &SeedGroup) -> Value {
         "held_out_success_without_contact": share_json(group, success_without_contact),
         "held_out_collision_rate": share_json(group, test_collision_rate),
         "success_joint": spread_json(&group.spread(success_joint)),
+        "success_per_arm": per_arm_json(group),
         "collision_rate": share_json(group, |run| {
             let last = run.last().filter(|_| run.reports_contacts());
             last.map(|row| (row.collision_rate, row.n_episodes))
@@ -178,6 +185,14 @@ fn milestone_json(group: &SeedGroup, milestone: (Quantity, f64)) -> Value {
         "advice_spent": at(|row| Some(row.advice_spent as f64)),
         "advice_queries": at(|row| Some(row.advice_queries? as f64)),
     })
+}
+
+/// Returns the spread of each arm's success, in the order of the arms.
+fn per_arm_json(group: &SeedGroup) -> Value {
+    let n_arms = group.runs.iter().map(|run| success_per_arm(run).len()).max().unwrap_or(0);
+    let of_arm =
+        |arm: usize| spread_json(&group.spread(|run| success_per_arm(run).get(arm).copied()));
+    (0..n_arms).map(of_arm).collect()
 }
 
 /// Returns a spread as JSON; `null` if no run has the value.
@@ -240,7 +255,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,,,,,"
+            "push,2,\"odd, name\",ea,\"odd, name-seed3\",3,2,2000,120,,,0.5,,2000,,,2,,,0,0.5,0,0,0,,,,,,,,,,,,,"
         );
         assert_eq!(lines[2].split(',').count(), n_columns);
     }
@@ -266,6 +281,7 @@ mod tests {
             success: 0.5,
             interval: Wilson::of(120, 240),
             success_joint: 0.25,
+            success_per_arm: vec![0.75, 0.625],
             collision_rate: Some(0.125),
             contacts: ContactMetrics::default(),
         }
@@ -299,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn json_has_the_contacts_and_the_joint_goal_of_the_tables() {
+    fn the_evaluation_on_test_goals_is_exported() {
         let mut compared = comparison();
         let [tested] = &mut compared.sections[0].groups[0].runs[..] else { panic!("one run") };
         tested.test = Some(half());
@@ -308,6 +324,10 @@ mod tests {
         assert_eq!(group["held_out_collision_rate"]["mean"], 0.125);
         assert_eq!(group["held_out_collision_rate"]["low"], json!(Wilson::of(30, 240).low));
         assert_eq!(group["success_joint"]["mean"], 0.25);
+        let per_arm = &group["success_per_arm"];
+        assert_eq!((&per_arm[0]["mean"], &per_arm[1]["mean"]), (&json!(0.75), &json!(0.625)));
+        assert_eq!(per_arm.as_array().map(Vec::len), Some(2));
+        assert!(csv(&compared).lines().any(|line| line.contains(",0.25,0.75 0.625,")));
         assert_eq!(group["collision_rate"]["mean"], 0.0, "of the last evaluation");
     }
 }

@@ -357,6 +357,7 @@ mod tests {
             success: 0.95,
             interval: Wilson { low: 0.94, high: 0.96 },
             success_joint: 0.9,
+            success_per_arm: Vec::new(),
             collision_rate: Some(0.2),
             contacts: ContactMetrics::default(),
         };

@@ -25,6 +25,8 @@ pub struct TestEvaluation {
     pub interval: Wilson,
     /// Share of episodes with the joint norm within the tolerance, in [0, 1].
     pub success_joint: f64,
+    /// For each arm, the share of episodes with its own object at its goal. Empty if it is unknown.
+    pub success_per_arm: Vec<f64>,
     /// Share of episodes with at least one contact between the arms, or between an arm and the table. `None` for a task
     /// that reports no contacts.
     pub collision_rate: Option<f64>,
@@ -57,8 +59,7 @@ impl TestEvaluation {
 
     fn of(object: &Value) -> Result<Self, String> {
         let number = |key: &str| {
-            let share = object[key].as_f64().filter(|share| (0.0..=1.0).contains(share));
-            share.ok_or_else(|| format!("{key:?} is not a share from 0 to 1"))
+            share(&object[key]).ok_or_else(|| format!("{key:?} is not a share from 0 to 1"))
         };
         let count =
             |key: &str| object[key].as_u64().ok_or_else(|| format!("{key:?} is not a count"));
@@ -70,6 +71,8 @@ impl TestEvaluation {
             success: number("success")?,
             interval: Wilson { low: number("success_low")?, high: number("success_high")? },
             success_joint: number("success_joint")?,
+            success_per_arm: shares(&object["success_per_arm"])
+                .ok_or("\"success_per_arm\" is not a list of shares from 0 to 1")?,
             collision_rate: match object.get("collision_rate") {
                 // Of a task that reports no contacts.
                 Some(Value::Null) => None,
@@ -78,6 +81,18 @@ impl TestEvaluation {
             contacts: serde_json::from_value(object.clone())
                 .map_err(|error| format!("a measure of contacts is not a number ({error})"))?,
         })
+    }
+}
+
+fn share(value: &Value) -> Option<f64> {
+    value.as_f64().filter(|share| (0.0..=1.0).contains(share))
+}
+
+/// Returns the shares in a list, which is empty if it is missing.
+fn shares(value: &Value) -> Option<Vec<f64>> {
+    match value {
+        Value::Null => Some(Vec::new()),
+        value => value.as_array()?.iter().map(share).collect(),
     }
 }
 
@@ -133,6 +148,22 @@ mod tests {
         assert_eq!((test.success, test.interval), (0.958, Wilson { low: 0.925, high: 0.977 }));
         assert_eq!((test.success_joint, test.collision_rate), (0.9, Some(0.175)));
         assert_eq!(test.contacts, ContactMetrics::default(), "of an earlier version");
+    }
+
+    #[test]
+    fn the_success_of_each_arm_is_read_if_there_is_one() {
+        let parse = |per_arm: &str| {
+            let more = format!(r#""success_per_arm":{per_arm},"collision_rate""#);
+            let line = LINE.replace(r#""collision_rate""#, &more).replace('\n', "");
+            TestEvaluation::parse(&line).map(|(test, _)| test.success_per_arm)
+        };
+        assert_eq!(parse("[0.75,1]"), Ok(vec![0.75, 1.0]));
+        assert_eq!(parse("null"), Ok(Vec::new()));
+        for invalid in ["0.75", "[0.75,2]", r#"["high"]"#] {
+            assert!(parse(invalid).unwrap_err().contains("success_per_arm"), "{invalid}");
+        }
+        let earlier = TestEvaluation::parse(&LINE.replace('\n', "")).unwrap().0;
+        assert!(earlier.success_per_arm.is_empty());
     }
 
     #[test]

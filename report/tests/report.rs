@@ -300,6 +300,7 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
             success: 0.75,
             interval: tandem_core::Wilson { low: 0.69, high: 0.8 },
             success_joint: 0.7,
+            success_per_arm: vec![0.85, 0.9],
             collision_rate: None,
             contacts: ContactMetrics::default(),
         },

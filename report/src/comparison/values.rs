@@ -31,6 +31,15 @@ pub(crate) fn success_joint(run: &Run) -> Option<f64> {
     test.or_else(|| run.last().map(|row| row.success_joint))
 }
 
+/// Returns the success of each arm, on test goals or else of the last evaluation. Empty if it is unknown.
+pub(crate) fn success_per_arm(run: &Run) -> &[f64] {
+    match (&run.test, run.last()) {
+        (Some(test), _) => &test.success_per_arm,
+        (None, Some(row)) => &row.success_per_arm,
+        (None, None) => &[],
+    }
+}
+
 /// Returns the success without contact between the arms on test goals, and their number, if it is known.
 pub(crate) fn success_without_contact(run: &Run) -> Option<(f64, u64)> {
     let test = run.test.as_ref()?;
