@@ -36,6 +36,7 @@ pub(crate) enum BenchName {
     /// Time of sampling a batch with hindsight.
     Replay,
     /// The teacher service, compared with an echo service of the same messages.
+    #[value(alias = "wire")]
     Teacher,
     /// A short training run with all its processes.
     EndToEnd,
@@ -84,4 +85,16 @@ pub(crate) struct ScaleArgs {
 fn seconds_a_slot(text: &str) -> Result<f64, String> {
     let seconds = text.parse::<f64>().ok().filter(|seconds| (0.01..=600.0).contains(seconds));
     seconds.ok_or_else(|| "expected seconds, 0.01 to 600".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_benchmark_of_the_teacher_has_a_second_name() {
+        for name in ["teacher", "wire"] {
+            assert_eq!(BenchName::from_str(name, false), Ok(BenchName::Teacher));
+        }
+    }
 }
