@@ -124,6 +124,7 @@ mod tests {
                 success: *success,
                 interval: Wilson { low: 0.0, high: 1.0 },
                 success_joint: *success,
+                success_per_arm: Vec::new(),
                 collision_rate: Some(0.0),
                 contacts: ContactMetrics::default(),
             }),
