@@ -153,7 +153,11 @@ pub fn save(
     let owned = state::small_tensors(trainer, resumption);
     let mut tensors: Vec<Tensor<'_>> = owned
         .iter()
-        .map(|(name, dtype, bytes)| Tensor { name: name.clone(), dtype: *dtype, bytes })
+        .map(|(name, dtype, bytes)| Tensor {
+            name: name.clone(),
+            dtype: *dtype,
+            bytes: bytes.into(),
+        })
         .collect();
     tensors.extend(state::large_tensors(trainer));
     let metadata = state::metadata(trainer, resumption);

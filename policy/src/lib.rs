@@ -106,8 +106,8 @@ pub use error::{Error, FormatError};
 pub use inference::{Actor, Critic, QueryGate};
 pub use matrix::{Matrix, MatrixMut, multiply};
 pub use mlp::{
-    Activations, MlpShape, ParameterBlock, RowBlock, TransposedBlock, TransposedWeights, Workspace,
-    backward_input, backward_parameters, elementwise_blocks, forward,
+    Activations, MlpShape, ParameterBlock, RowBlock, TransposedBlock, TransposedParameters,
+    Workspace, backward_input, backward_parameters, elementwise_blocks, forward,
 };
 pub use normalizer::{Normalizer, NormalizerSnapshot, NormalizerState};
 pub use policy::{Policy, actor_digest};

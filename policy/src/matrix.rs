@@ -1,5 +1,7 @@
 //! Matrices as views of flat slices, and their product.
 
+use std::ops::Range;
+
 #[cfg(miri)]
 mod interpreted;
 
@@ -55,6 +57,16 @@ impl<'a> Matrix<'a> {
     #[must_use]
     pub const fn n_rows(&self) -> usize {
         self.n_rows
+    }
+
+    /// Returns some columns, a view of the same numbers.
+    ///
+    /// # Panics
+    /// If the matrix has fewer columns.
+    #[must_use]
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        assert!(columns.end <= self.n_cols, "columns beyond the matrix");
+        Self { data: &self.data[columns.start * self.col_stride..], n_cols: columns.len(), ..self }
     }
 }
 
@@ -151,6 +163,18 @@ pub fn multiply(product: &mut MatrixMut<'_>, lhs: Matrix<'_>, rhs: Matrix<'_>) {
             gemm::Parallelism::None,
         );
     }
+}
+
+/// Returns the most columns of a product for which [`multiply`] reads a first factor in place although it is a transposed
+/// view. With more columns it copies that factor first, which takes longer than a second product.
+///
+/// Only the tiles of AVX-512, 64 columns each, are broad enough for such products.
+pub(crate) fn max_columns_in_place() -> usize {
+    #[cfg(target_arch = "x86_64")]
+    if matches!(Arch::new(), Arch::V4(_)) {
+        return 2 * 64;
+    }
+    usize::MAX
 }
 
 /// Writes the transpose of `source`, shape `[n_rows, n_cols]`, to `transposed`, shape `[n_cols, n_rows]`. The rows of

@@ -11,7 +11,8 @@ use crate::matrix::{Matrix, MatrixMut};
 mod parts;
 
 pub use parts::{
-    Activations, ParameterBlock, RowBlock, TransposedBlock, TransposedWeights, elementwise_blocks,
+    Activations, ParameterBlock, RowBlock, TransposedBlock, TransposedParameters,
+    elementwise_blocks,
 };
 
 /// The sizes of a network: input, hidden layers of equal width, output.
@@ -129,7 +130,7 @@ impl MlpShape {
 #[derive(Debug, Clone)]
 pub struct Workspace {
     activations: Activations,
-    weights: TransposedWeights,
+    parameters: TransposedParameters,
 }
 
 impl Workspace {
@@ -139,7 +140,7 @@ impl Workspace {
         let no_parameters = vec![0.0; shape.n_parameters()];
         Self {
             activations: Activations::new(shape, max_batch),
-            weights: TransposedWeights::new(shape, &no_parameters),
+            parameters: TransposedParameters::new(shape, &no_parameters),
         }
     }
 }
@@ -156,10 +157,10 @@ pub fn forward(
     workspace: &mut Workspace,
     output: &mut MatrixMut<'_>,
 ) {
-    let Workspace { activations, weights } = workspace;
-    weights.update(shape, parameters);
+    let Workspace { activations, parameters: transposed } = workspace;
+    transposed.update(shape, parameters);
     let mut rows = activations.block(input.n_rows());
-    rows.forward(shape, parameters, weights, input, output);
+    rows.forward(shape, transposed, input, output);
 }
 
 /// Computes the gradient of the loss with respect to the parameters, shape `[n_parameters]`, from its gradient with

@@ -2,6 +2,7 @@
 //!
 //! Pure: the result depends only on the configuration and on the episodes in their order.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use sha2::{Digest as _, Sha256};
@@ -283,7 +284,7 @@ impl Trainer {
     pub fn publish(&self) -> PublishedActor {
         let actor = match self.config.behaviour {
             Behaviour::Target => self.ddpg.target_actor(),
-            Behaviour::Online => self.ddpg.actor(),
+            Behaviour::Online => self.ddpg.actor().to_vec(),
         };
         let NormalizerSnapshot { mean: observation_mean, std: observation_std } =
             self.observation_normalizer.snapshot().clone();
@@ -293,7 +294,7 @@ impl Trainer {
             version: self.counters.round,
             n_hidden: self.config.ddpg.n_hidden,
             n_hidden_layers: self.config.ddpg.n_hidden_layers,
-            actor: actor.to_vec(),
+            actor,
             observation_mean,
             observation_std,
             goal_mean,
@@ -309,15 +310,15 @@ impl Trainer {
     pub fn policy(&self, metadata: BTreeMap<String, String>) -> Policy {
         let (actor, critic) = match self.config.behaviour {
             Behaviour::Target => (self.ddpg.target_actor(), self.ddpg.target_critic()),
-            Behaviour::Online => (self.ddpg.actor(), self.ddpg.critic()),
+            Behaviour::Online => (self.ddpg.actor().to_vec(), self.ddpg.critic().to_vec()),
         };
         Policy {
             task: self.task.clone(),
             n_hidden: self.config.ddpg.n_hidden,
             n_hidden_layers: self.config.ddpg.n_hidden_layers,
             n_heads: self.config.replay.reward.n_heads(&self.task),
-            actor: actor.to_vec(),
-            critic: critic.to_vec(),
+            actor,
+            critic,
             observation_normalizer: self.observation_normalizer.snapshot().clone(),
             goal_normalizer: self.goal_normalizer.snapshot().clone(),
             metadata,
@@ -330,7 +331,7 @@ impl Trainer {
         let mut hash = Sha256::new();
         for (name, values) in self.tensors() {
             hash.update(name.as_bytes());
-            hash.update(bytemuck::cast_slice::<f32, u8>(values));
+            hash.update(bytemuck::cast_slice::<f32, u8>(&values));
         }
         for normalizer in [&self.observation_normalizer, &self.goal_normalizer] {
             let seen = normalizer.state();
@@ -359,7 +360,7 @@ impl Trainer {
 
     /// Returns the large float vectors of the state by name, in a fixed order.
     #[must_use]
-    pub fn tensors(&self) -> Vec<(String, &[f32])> {
+    pub fn tensors(&self) -> Vec<(String, Cow<'_, [f32]>)> {
         let (parts, _) = self.replay.parts();
         let replay = [
             ("replay.observations", parts.observations.as_slice()),
@@ -369,8 +370,10 @@ impl Trainer {
         let ddpg =
             self.ddpg.state().into_iter().map(|(name, values)| (format!("ddpg.{name}"), values));
         let ensemble = self.ensemble.iter().flat_map(CriticEnsemble::state);
-        let ensemble = ensemble.map(|(name, values)| (format!("ensemble.{name}"), values));
-        ddpg.chain(replay.map(|(name, values)| (name.to_owned(), values))).chain(ensemble).collect()
+        let ensemble =
+            ensemble.map(|(name, values)| (format!("ensemble.{name}"), Cow::from(values)));
+        let replay = replay.map(|(name, values)| (name.to_owned(), Cow::from(values)));
+        ddpg.chain(replay).chain(ensemble).collect()
     }
 
     /// Updates the normalisers with an episode's observations, and with goals relabelled as in a batch.

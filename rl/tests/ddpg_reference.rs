@@ -71,7 +71,7 @@ fn every_update_agrees_with_the_reference() {
         assert_close("actor gradient", actor, &update["gradient"]["actor"]);
         assert_close("critic gradient", critic, &update["gradient"]["critic"]);
         for (name, vector) in ddpg.state() {
-            assert_close(name, vector, &update["after"][name]);
+            assert_close(name, &vector, &update["after"][name]);
         }
     }
 }

@@ -3,6 +3,7 @@
 //! The header begins with the seal, the SHA-256 of the whole file with zeros in place of the seal. Any flipped bit, in
 //! the header, the metadata or a tensor, invalidates it.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Read as _, Write as _};
@@ -34,7 +35,7 @@ pub(super) struct Tensor<'a> {
     pub(super) name: String,
     pub(super) dtype: Dtype,
     /// Little-endian numbers.
-    pub(super) bytes: &'a [u8],
+    pub(super) bytes: Cow<'a, [u8]>,
 }
 
 /// The contents of a file whose seal is valid.
@@ -60,12 +61,12 @@ pub(super) fn write(
 ) -> io::Result<String> {
     let mut start = start(metadata, tensors)?;
     let mut hash = Sha256::new_with_prefix(&start);
-    tensors.iter().for_each(|tensor| hash.update(tensor.bytes));
+    tensors.iter().for_each(|tensor| hash.update(&tensor.bytes));
     let seal = hex(&hash.finalize());
     start[SEAL].copy_from_slice(seal.as_bytes());
     file.write_all(&start)?;
     for tensor in tensors {
-        file.write_all(tensor.bytes)?;
+        file.write_all(&tensor.bytes)?;
     }
     Ok(seal)
 }

@@ -1,5 +1,7 @@
 //! Conversion of the learning state to named vectors and numbers, and back.
 
+use std::borrow::Cow;
+
 use safetensors::Dtype;
 use tandem_core::work::{PublishedActor, PublishedGate};
 use tandem_policy::{Normalizer, NormalizerSnapshot, NormalizerState, Policy};
@@ -124,15 +126,21 @@ pub(super) fn large_tensors(trainer: &Trainer) -> Vec<Tensor<'_>> {
     let floats = trainer.tensors().into_iter().map(|(name, values)| Tensor {
         name,
         dtype: Dtype::F32,
-        bytes: bytemuck::cast_slice(values),
+        bytes: match values {
+            Cow::Borrowed(values) => Cow::from(bytemuck::cast_slice(values)),
+            Cow::Owned(values) => Cow::from(bytemuck::cast_slice(&values).to_vec()),
+        },
     });
     let bytes = [
         ("replay.advised_arms", &parts.advised_arms),
         ("replay.contacts", &parts.contacts),
         ("replay.moved", &parts.moved),
     ];
-    let bytes =
-        bytes.map(|(name, bytes)| Tensor { name: name.to_owned(), dtype: Dtype::U8, bytes });
+    let bytes = bytes.map(|(name, bytes)| Tensor {
+        name: name.to_owned(),
+        dtype: Dtype::U8,
+        bytes: bytes.into(),
+    });
     floats.chain(bytes).collect()
 }
 

@@ -10,7 +10,7 @@ use std::ops::Range;
 use super::MlpShape;
 use crate::aligned::AlignedVec;
 use crate::elementwise::{add_bias, add_bias_relu, column_sums, mask};
-use crate::matrix::{Matrix, MatrixMut, multiply, transpose};
+use crate::matrix::{Matrix, MatrixMut, max_columns_in_place, multiply, transpose};
 
 /// Rows, or columns, of a register tile of the matrix product. A block of a multiple of it wastes no lanes.
 const TILE: usize = 6;
@@ -164,8 +164,7 @@ impl RowBlock<'_> {
     pub fn forward(
         &mut self,
         shape: &MlpShape,
-        parameters: &[f32],
-        weights: &TransposedWeights,
+        parameters: &TransposedParameters,
         input: Matrix<'_>,
         output: &mut MatrixMut<'_>,
     ) {
@@ -176,14 +175,14 @@ impl RowBlock<'_> {
                 below.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
             let rows = &mut *above[0];
             let mut product = MatrixMut::new(rows, n_rows, shape.n_hidden);
-            multiply(&mut product, layer_input, weights.of_layer(shape, layer));
-            add_bias_relu(rows, &parameters[shape.bias(layer)]);
+            multiply(&mut product, layer_input, parameters.weight(shape, layer));
+            add_bias_relu(rows, parameters.bias(shape, layer));
         }
         let last = shape.n_hidden_layers;
         let layer_input =
             self.hidden.last().map_or(input, |rows| Matrix::new(rows, n_rows, shape.n_hidden));
-        multiply(output, layer_input, weights.of_layer(shape, last));
-        add_bias(output, &parameters[shape.bias(last)]);
+        multiply(output, layer_input, parameters.weight(shape, last));
+        add_bias(output, parameters.bias(shape, last));
     }
 
     /// Computes and stores the gradient of the loss with respect to the activations, from its gradient with respect to
@@ -258,29 +257,33 @@ impl Activations {
         };
         let (weight, bias) = gradient.split_at_mut(outputs.len() * n_in);
         let of_outputs = Matrix::with_stride(&rows[outputs.start..], n_rows, outputs.len(), n_out);
-        multiply(
-            &mut MatrixMut::new(weight, outputs.len(), n_in),
-            of_outputs.transposed(),
-            layer_input,
-        );
+        let max_cols = max_columns_in_place().min(n_in);
+        for start in (0..n_in).step_by(max_cols) {
+            let n_cols = max_cols.min(n_in - start);
+            multiply(
+                &mut MatrixMut::with_stride(&mut weight[start..], outputs.len(), n_cols, n_in),
+                of_outputs.transposed(),
+                layer_input.columns(start..start + n_cols),
+            );
+        }
         if !bias.is_empty() {
             column_sums(rows, bias);
         }
     }
 }
 
-/// The weights of all layers, each transposed to shape `[in, out]`. A product with a transposed weight is faster than
-/// one with a transposed view.
+/// The parameters of all layers, with each weight transposed to shape `[in, out]`. A product with a transposed weight is
+/// faster than one with a transposed view.
 #[derive(Debug, Clone)]
-pub struct TransposedWeights(AlignedVec);
+pub struct TransposedParameters(AlignedVec);
 
-impl TransposedWeights {
+impl TransposedParameters {
     /// Transposes the weights in `parameters`, shape `[n_parameters]`.
     #[must_use]
     pub fn new(shape: &MlpShape, parameters: &[f32]) -> Self {
-        let mut weights = Self(AlignedVec::zeros(Self::start(shape, shape.n_layers())));
-        weights.update(shape, parameters);
-        weights
+        let mut transposed = Self(AlignedVec::zeros(shape.n_parameters()));
+        transposed.update(shape, parameters);
+        transposed
     }
 
     /// Transposes the weights in `parameters`, shape `[n_parameters]`.
@@ -296,51 +299,73 @@ impl TransposedWeights {
         for layer in 0..shape.n_layers() {
             let n_out = shape.layer_output(layer);
             let max_tiles = (ELEMENTWISE_BLOCK / (n_out * TILE)).max(1);
-            for inputs in split(shape.layer_input(layer), max_tiles) {
-                let (weights, others) = rest.split_at_mut(inputs.len() * n_out);
-                blocks.push(TransposedBlock { layer, inputs, weights });
+            let n_in = shape.layer_input(layer);
+            for inputs in split(n_in, max_tiles) {
+                let (weight, others) = rest.split_at_mut(inputs.len() * n_out);
+                let n_biases = if inputs.end == n_in { n_out } else { 0 };
+                let (bias, others) = others.split_at_mut(n_biases);
+                blocks.push(TransposedBlock { layer, inputs, weight, bias });
                 rest = others;
             }
         }
         blocks
     }
 
-    /// Returns the weights of all layers, one layer after the other, for elementwise work.
+    /// Returns the parameters as they were before the transposition, shape `[n_parameters]`.
+    #[must_use]
+    pub fn transposed_back(&self, shape: &MlpShape) -> Vec<f32> {
+        let mut parameters = vec![0.0; shape.n_parameters()];
+        for layer in 0..shape.n_layers() {
+            let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
+            let weight = &mut parameters[shape.weight(layer)];
+            transpose(&self.0[shape.weight(layer)], n_out, weight, n_in, n_out);
+            parameters[shape.bias(layer)].copy_from_slice(self.bias(shape, layer));
+        }
+        parameters
+    }
+
+    /// Returns the transposed weight and the bias of each layer, one layer after the other, for elementwise work.
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
         &mut self.0
     }
 
-    /// Returns the weights of all layers, one layer after the other.
+    /// Returns the transposed weight and the bias of each layer, one layer after the other.
     #[must_use]
     pub fn as_slice(&self) -> &[f32] {
         &self.0
     }
 
-    fn of_layer(&self, shape: &MlpShape, layer: usize) -> Matrix<'_> {
-        let weights = &self.0[Self::start(shape, layer)..];
-        Matrix::new(weights, shape.layer_input(layer), shape.layer_output(layer))
+    fn weight(&self, shape: &MlpShape, layer: usize) -> Matrix<'_> {
+        let weight = &self.0[shape.weight(layer)];
+        Matrix::new(weight, shape.layer_input(layer), shape.layer_output(layer))
     }
 
-    fn start(shape: &MlpShape, layer: usize) -> usize {
-        (0..layer).map(|below| shape.weight(below).len()).sum()
+    fn bias(&self, shape: &MlpShape, layer: usize) -> &[f32] {
+        &self.0[shape.bias(layer)]
     }
 }
 
-/// The transposed weights of some inputs of a layer.
+/// The transposed weights of some inputs of a layer. The last block of a layer includes its bias.
 #[derive(Debug)]
 pub struct TransposedBlock<'a> {
     layer: usize,
     inputs: Range<usize>,
     /// Shape `[inputs.len(), out]`.
-    weights: &'a mut [f32],
+    weight: &'a mut [f32],
+    /// Shape `[out]`, or empty.
+    bias: &'a mut [f32],
 }
 
 impl TransposedBlock<'_> {
-    /// Transposes the weights of the block from `parameters`, shape `[n_parameters]`.
+    /// Copies the block from `parameters`, shape `[n_parameters]`, and transposes its weights.
     pub fn update(self, shape: &MlpShape, parameters: &[f32]) {
-        let (n_in, n_out) = (shape.layer_input(self.layer), shape.layer_output(self.layer));
-        let source = &parameters[shape.weight(self.layer)][self.inputs.start..];
-        transpose(source, n_in, self.weights, n_out, self.inputs.len());
+        let Self { layer, inputs, weight, bias } = self;
+        let (n_in, n_out) = (shape.layer_input(layer), shape.layer_output(layer));
+        let source = &parameters[shape.weight(layer)][inputs.start..];
+        transpose(source, n_in, weight, n_out, inputs.len());
+        if !bias.is_empty() {
+            bias.copy_from_slice(&parameters[shape.bias(layer)]);
+        }
     }
 }
 
@@ -370,6 +395,17 @@ mod tests {
                     assert!(smallest >= least, "{smallest} of {n_rows} rows");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn transposing_twice_restores_the_parameters() {
+        for (n_hidden, n_output) in [(6, 1), (37, 2), (256, 8)] {
+            let shape = MlpShape { n_input: 62, n_hidden, n_hidden_layers: 3, n_output };
+            let parameters: Vec<f32> = (0..shape.n_parameters()).map(|idx| idx as f32).collect();
+            let transposed = TransposedParameters::new(&shape, &parameters);
+            assert_ne!(transposed.as_slice(), parameters);
+            assert_eq!(transposed.transposed_back(&shape), parameters);
         }
     }
 

@@ -138,8 +138,7 @@ impl ActorRows<'_> {
         let mut action_columns = action_columns(self.input, &actor.shape, n_state_action, n_rows);
         self.activations.forward(
             &actor.shape,
-            &actor.online,
-            &actor.online_weights,
+            &actor.online_transposed,
             Matrix::new(inputs, n_rows, n_input),
             &mut action_columns,
         );
@@ -147,8 +146,7 @@ impl ActorRows<'_> {
         let mut values = scratch.critic.block(n_rows);
         values.forward(
             &critic.shape,
-            &critic.online,
-            &critic.online_weights,
+            &critic.online_transposed,
             Matrix::new(self.input, n_rows, n_state_action),
             &mut MatrixMut::new(self.q, n_rows, n_heads),
         );

@@ -123,16 +123,14 @@ impl<'a> CriticRows<'a> {
             action_columns(self.next_input, &actor.shape, n_state_action, n_rows);
         scratch.actor.block(n_rows).forward(
             &actor.shape,
-            &actor.target,
-            &actor.target_weights,
+            &actor.target_transposed,
             next_inputs,
             &mut action_columns,
         );
         squash(&mut action_columns);
         scratch.critic.block(n_rows).forward(
             &critic.shape,
-            &critic.target,
-            &critic.target_weights,
+            &critic.target_transposed,
             Matrix::new(self.next_input, n_rows, n_state_action),
             &mut MatrixMut::new(self.targets, n_rows, n_heads),
         );
@@ -145,8 +143,7 @@ impl<'a> CriticRows<'a> {
         write_columns(self.input, n_state_action, n_input, actions, n_action);
         self.activations.forward(
             &critic.shape,
-            &critic.online,
-            &critic.online_weights,
+            &critic.online_transposed,
             Matrix::new(self.input, n_rows, n_state_action),
             &mut MatrixMut::new(self.q, n_rows, n_heads),
         );

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rand_chacha::ChaCha8Rng;
 use tandem_policy::{
     Activations, Adam, AdamPart, AlignedVec, Matrix, MlpShape, ParameterBlock, TransposedBlock,
-    TransposedWeights, all_finite, elementwise_blocks, polyak_update,
+    TransposedParameters, all_finite, elementwise_blocks, polyak_update,
 };
 
 /// A network, its target network and its optimiser. Parameters are flat vectors.
@@ -13,11 +13,10 @@ use tandem_policy::{
 pub(super) struct Network {
     pub(super) shape: MlpShape,
     pub(super) online: AlignedVec,
-    pub(super) target: AlignedVec,
-    /// The weights in `online`, transposed.
-    pub(super) online_weights: TransposedWeights,
-    /// The weights in `target`, transposed.
-    pub(super) target_weights: TransposedWeights,
+    /// A copy of `online` for forward passes.
+    pub(super) online_transposed: TransposedParameters,
+    /// The target network. It has no backward pass, so there is no other copy of it.
+    pub(super) target_transposed: TransposedParameters,
     /// Gradient of the loss with respect to `online` in the last update.
     pub(super) gradient: AlignedVec,
     pub(super) adam: Adam,
@@ -27,25 +26,28 @@ pub(super) struct Network {
 impl Network {
     pub(super) fn new(shape: MlpShape, learning_rate: f32, rng: &mut ChaCha8Rng) -> Self {
         let online = AlignedVec::from(&*shape.initialise(rng));
-        let online_weights = TransposedWeights::new(&shape, &online);
+        let online_transposed = TransposedParameters::new(&shape, &online);
         Self {
-            target: online.clone(),
-            target_weights: online_weights.clone(),
+            target_transposed: online_transposed.clone(),
             gradient: AlignedVec::zeros(online.len()),
             adam: Adam::new(online.len(), learning_rate),
             blocks: shape.parameter_blocks(),
             shape,
             online,
-            online_weights,
+            online_transposed,
         }
+    }
+
+    /// Returns the parameters of the target network, shape `[n_parameters]`.
+    pub(super) fn target(&self) -> Vec<f32> {
+        self.target_transposed.transposed_back(&self.shape)
     }
 
     /// Replaces the parameters of both networks, each of shape `[n_parameters]`.
     pub(super) fn set(&mut self, online: &[f32], target: &[f32]) {
         self.online.copy_from_slice(online);
-        self.target.copy_from_slice(target);
-        self.online_weights.update(&self.shape, online);
-        self.target_weights.update(&self.shape, target);
+        self.online_transposed.update(&self.shape, online);
+        self.target_transposed.update(&self.shape, target);
     }
 
     /// Returns the tasks that compute the gradient and make a step of Adam with it.
@@ -64,28 +66,24 @@ impl Network {
         tasks.collect()
     }
 
-    /// Returns the tasks that transpose the weights in `online`.
+    /// Returns the tasks that copy `online` for forward passes.
     pub(super) fn transpose(&mut self) -> Vec<TransposeTask<'_>> {
-        let Self { shape, online, online_weights, .. } = self;
-        let blocks = online_weights.blocks(shape).into_iter();
+        let Self { shape, online, online_transposed, .. } = self;
+        let blocks = online_transposed.blocks(shape).into_iter();
         blocks.map(|block| TransposeTask { shape, parameters: online, block }).collect()
     }
 
     /// Returns the tasks that move the target network toward the online one.
     pub(super) fn polyak(&mut self) -> Vec<PolyakTask<'_>> {
-        let Self { online, target, online_weights, target_weights, .. } = self;
-        let mut tasks = Vec::new();
-        for (mut target, mut online) in
-            [(&mut **target, &**online), (target_weights.as_mut_slice(), online_weights.as_slice())]
-        {
-            for length in elementwise_blocks(target.len()) {
-                let (target_part, target_rest) = target.split_at_mut(length);
-                let (online_part, online_rest) = online.split_at(length);
-                tasks.push(PolyakTask { target: target_part, online: online_part });
-                (target, online) = (target_rest, online_rest);
-            }
-        }
-        tasks
+        let mut target = self.target_transposed.as_mut_slice();
+        let mut online = self.online_transposed.as_slice();
+        let tasks = elementwise_blocks(target.len()).map(|length| {
+            let (target_part, target_rest) = std::mem::take(&mut target).split_at_mut(length);
+            let (online_part, online_rest) = online.split_at(length);
+            (target, online) = (target_rest, online_rest);
+            PolyakTask { target: target_part, online: online_part }
+        });
+        tasks.collect()
     }
 }
 
@@ -165,7 +163,7 @@ impl TransposeTask<'_> {
     }
 }
 
-/// Polyak averaging of a block of parameters, or of transposed weights.
+/// Polyak averaging of some parameters.
 #[derive(Debug)]
 pub(super) struct PolyakTask<'a> {
     target: &'a mut [f32],

@@ -1,5 +1,7 @@
 //! Access to the networks and their optimisers, for checkpoints and policies.
 
+use std::borrow::Cow;
+
 use tandem_policy::{MlpShape, Policy};
 
 use super::{Ddpg, DdpgConfig, DdpgError};
@@ -46,8 +48,8 @@ impl Ddpg {
 
     /// Returns the parameters of the actor's target network, of the same shape.
     #[must_use]
-    pub fn target_actor(&self) -> &[f32] {
-        &self.actor.target
+    pub fn target_actor(&self) -> Vec<f32> {
+        self.actor.target()
     }
 
     /// Returns the critic's parameters, shape `[n_parameters]` of [`critic_shape`](Self::critic_shape).
@@ -58,8 +60,8 @@ impl Ddpg {
 
     /// Returns the parameters of the critic's target network, of the same shape.
     #[must_use]
-    pub fn target_critic(&self) -> &[f32] {
-        &self.critic.target
+    pub fn target_critic(&self) -> Vec<f32> {
+        self.critic.target()
     }
 
     /// Returns the critic's inputs and targets in the last update.
@@ -88,18 +90,18 @@ impl Ddpg {
     /// Every vector that the next update depends on, by name, in a fixed order. With [`Ddpg::n_updates`] it is the
     /// whole state.
     #[must_use]
-    pub fn state(&self) -> [(&'static str, &[f32]); 8] {
+    pub fn state(&self) -> [(&'static str, Cow<'_, [f32]>); 8] {
         let [actor_first, actor_second] = self.actor.adam.moments();
         let [critic_first, critic_second] = self.critic.adam.moments();
         [
-            ("actor.online", &self.actor.online),
-            ("actor.target", &self.actor.target),
-            ("actor.adam.first", actor_first),
-            ("actor.adam.second", actor_second),
-            ("critic.online", &self.critic.online),
-            ("critic.target", &self.critic.target),
-            ("critic.adam.first", critic_first),
-            ("critic.adam.second", critic_second),
+            ("actor.online", Cow::from(&*self.actor.online)),
+            ("actor.target", Cow::from(self.actor.target())),
+            ("actor.adam.first", Cow::from(actor_first)),
+            ("actor.adam.second", Cow::from(actor_second)),
+            ("critic.online", Cow::from(&*self.critic.online)),
+            ("critic.target", Cow::from(self.critic.target())),
+            ("critic.adam.first", Cow::from(critic_first)),
+            ("critic.adam.second", Cow::from(critic_second)),
         ]
     }
 

@@ -69,7 +69,7 @@ fn policy(shape: &MlpShape, parameters: &[f64], input: &[f64]) -> Vec<f64> {
 
 fn critic_loss(ddpg: &Ddpg, critic: &[f64], batch: &Batch) -> f64 {
     let (actor_shape, critic_shape) = (ddpg.actor_shape(), ddpg.critic_shape());
-    let (target_actor, target_critic) = (exact(ddpg.target_actor()), exact(ddpg.target_critic()));
+    let (target_actor, target_critic) = (exact(&ddpg.target_actor()), exact(&ddpg.target_critic()));
     let discount = f64::from(ddpg.config().discount);
     let rows =
         exact(&batch.inputs).chunks(actor_shape.n_input).map(<[f64]>::to_vec).collect::<Vec<_>>();

@@ -135,8 +135,7 @@ fn a_round_is_learned_with_the_value_of_every_schedule_in_that_round() {
 /// Returns the parameters of both online networks, then those of both target networks.
 fn online_and_target(trainer: &Trainer) -> [Vec<f32>; 2] {
     let ddpg = &trainer.ddpg;
-    [[ddpg.actor(), ddpg.critic()], [ddpg.target_actor(), ddpg.target_critic()]]
-        .map(|networks| networks.concat())
+    [[ddpg.actor(), ddpg.critic()].concat(), [ddpg.target_actor(), ddpg.target_critic()].concat()]
 }
 
 #[test]
