@@ -15,6 +15,7 @@
 //! ```
 #![warn(missing_docs)]
 
+mod bitmap;
 mod color;
 pub mod comparison;
 pub mod curve;

@@ -7,11 +7,14 @@ mod trials;
 
 use std::path::{Path, PathBuf};
 
+use rayon::prelude::*;
+
+use crate::bitmap::Converter;
 use crate::comparison::{Comparison, FilmStrip};
 use crate::error::Error;
 use crate::files::{create_directory, write};
 use crate::html::page;
-use crate::plots::comparison_plots;
+use crate::plots::{Plot, comparison_plots};
 use crate::run::Run;
 use crate::trials::{PlottedTrials, Trials};
 
@@ -31,8 +34,8 @@ pub fn run_report_html(run_dir: &Path, films: &[FilmStrip]) -> Result<PathBuf, E
 pub struct ReportFiles {
     /// The HTML page, which contains all plots.
     pub page: PathBuf,
-    /// The plots as SVG files and the film strips as PNG files, in a directory named after the page: `report-figures`
-    /// beside `report.html`.
+    /// The plots as SVG files, the curves also as PNG files of twice the size, and the film strips as PNG files, in a
+    /// directory named after the page: `report-figures` beside `report.html`.
     pub plots: Vec<PathBuf>,
 }
 
@@ -51,10 +54,13 @@ pub fn report_html(
     let trial_plots = trials.plots(plotted);
     let mut files = ReportFiles { page: path.to_owned(), plots: Vec::new() };
     let svgs = curves.all().chain(&trial_plots);
-    let svgs = svgs.map(|plot| (&plot.file_name, plot.svg.as_bytes()));
-    let films = comparison.films.iter().map(|film| (&film.file_name, film.png.as_slice()));
+    let svgs = svgs.map(|plot| (PathBuf::from(&plot.file_name), plot.svg.as_bytes()));
+    let pngs = pngs(curves.all())?;
+    let pngs = pngs.iter().map(|(file_name, png)| (file_name.clone(), png.as_slice()));
+    let films = comparison.films.iter();
+    let films = films.map(|film| (PathBuf::from(&film.file_name), film.png.as_slice()));
     let directory = figures::directory(path);
-    for (file_name, content) in svgs.chain(films) {
+    for (file_name, content) in svgs.chain(pngs).chain(films) {
         if files.plots.is_empty() {
             create_directory(&directory)?;
         }
@@ -78,4 +84,15 @@ pub fn report_html(
     write(path, page(title, &body).as_bytes())?;
     figures::remove_former(&directory, &files.plots)?;
     Ok(files)
+}
+
+/// Returns the plots as PNG, each with the name of its file.
+fn pngs<'a>(plots: impl Iterator<Item = &'a Plot>) -> Result<Vec<(PathBuf, Vec<u8>)>, Error> {
+    let plots: Vec<&Plot> = plots.collect();
+    let converter = Converter::new();
+    let pngs = plots.par_iter().map(|plot| {
+        let file_name = Path::new(&plot.file_name).with_extension("png");
+        Ok((file_name, converter.png(&plot.svg, &plot.title)?))
+    });
+    pngs.collect()
 }

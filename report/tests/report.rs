@@ -194,8 +194,9 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     let written =
         report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
     let page = std::fs::read_to_string(&written.page).unwrap();
-    assert_eq!(page.matches("<div class=wide><svg").count(), written.plots.len() - 1);
-    assert_eq!(written.plots.len(), 7, "four of success, mean Q, advice, and a film strip");
+    let (svgs, pngs) = written.plots.split_at(6);
+    assert_eq!(page.matches("<div class=wide><svg").count(), svgs.len());
+    assert_eq!(pngs.len(), 7, "four curves of success, mean Q, advice, and a film strip");
     let contains = [
         "MC-ACTABS005",
         "0.9625",
@@ -211,9 +212,10 @@ fn the_page_of_a_sweep_has_tables_curves_and_the_papers_values() {
     }
     let first = |text: &str| page.find(text).unwrap_or_else(|| panic!("{text}"));
     assert!(first("<svg") < first("<table") && first("<table") < first("<details"));
-    let (svgs, film) = written.plots.split_at(6);
-    assert_eq!(std::fs::read(&film[0]).unwrap(), b"png");
-    for svg in svgs {
+    assert_eq!(std::fs::read(&pngs[6]).unwrap(), b"png");
+    for (svg, png) in svgs.iter().zip(pngs) {
+        assert_eq!(*png, svg.with_extension("png"));
+        assert!(std::fs::read(png).unwrap().starts_with(b"\x89PNG"), "{png:?}");
         let svg = std::fs::read_to_string(svg).unwrap();
         assert_well_formed(&svg);
         assert!(svg.contains("mc-q:0.1") && svg.contains("none"));
@@ -323,8 +325,9 @@ fn a_described_task_has_its_own_section_beside_a_built_in_one() {
     let page = dir.path().join("report.html");
     let written =
         report_html(&comparison, &Trials::default(), PlottedTrials::Failed, &page).unwrap();
-    assert_eq!(written.plots.len(), 12, "six for each task");
-    for svg in &written.plots {
+    let (svgs, pngs) = written.plots.split_at(12);
+    assert_eq!(pngs.len(), svgs.len(), "six for each task");
+    for svg in svgs {
         let figures = dir.path().join("report-figures");
         assert_eq!(svg.parent(), Some(figures.as_path()), "a task's name makes no directory");
         let name = svg.file_name().unwrap().to_str().unwrap();

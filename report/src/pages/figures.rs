@@ -38,7 +38,7 @@ pub(super) fn remove_former(directory: &Path, written: &[PathBuf]) -> Result<(),
 fn is_figure(name: &str) -> bool {
     match name.rsplit_once('.') {
         Some((stem, "svg")) => plots::is_file_stem(stem) || trials::is_file_stem(stem),
-        Some((stem, "png")) => is_film(stem),
+        Some((stem, "png")) => plots::is_file_stem(stem) || is_film(stem),
         _ => false,
     }
 }
@@ -56,6 +56,7 @@ mod tests {
     fn figures_are_recognised_by_their_names() {
         for name in [
             "push-2-success-environment-steps-strategies.svg",
+            "push-2-success-environment-steps-strategies.png",
             "push-success-without-contact-environment-steps-mc-act-abs.svg",
             "lab~reach-2-mean-q-paper-epochs-others-12.svg",
             "pick-and-place-from-scratch.svg",
@@ -71,7 +72,7 @@ mod tests {
             "push-2-success-environment-steps.svg",
             "push-2-success-environment-steps-mine.svg",
             "push-2-success-environment-steps-others-x.svg",
-            "push-2-success-environment-steps-strategies.png",
+            "push-2-success-environment-steps-strategies.gif",
             "mine-from-scratch.svg",
             "trial-push-seed1.svg",
             "trial-push-seed1-2-mine.svg",
