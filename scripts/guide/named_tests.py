@@ -6,7 +6,8 @@ from pathlib import Path
 
 from pages import ROOT
 
-NAME = re.compile(r"`(?!tandem_)([a-z0-9]+(?:_[a-z0-9]+){4,})`")  # A sentence. Metrics begin with tandem_.
+# A sentence. Names of metrics begin with tandem_, columns of reports with held_out_.
+NAME = re.compile(r"`(?!tandem_|held_out_)([a-z0-9]+(?:_[a-z0-9]+){4,})`")
 DEFINITION = re.compile(r"\b(?:fn|def) (\w+)")
 
 
