@@ -162,7 +162,7 @@ mod tests {
         let spread = ShareSpread::of(&[(0.4, 240), (0.5, 240), (0.6, 240)], 4);
         let MeanInterval { low, high } = spread.over_seeds.unwrap();
         assert_eq!(spread.shown_interval(), Some((low, high)));
-        assert_eq!(spread.pooled, Some(Wilson::of(360, 720)), "is kept beside it");
+        assert_eq!(spread.pooled, Some(Wilson::of(360, 720)), "the interval over episodes remains");
         assert_eq!((spread.values.n, spread.values.n_runs), (3, 4));
     }
 

@@ -70,43 +70,33 @@ async fn call_all(channel: &AuthChannel) -> Vec<(&'static str, Result<(), Status
     ]
 }
 
-/// Returns the services that reflection lists.
-async fn reflect_v1(channel: &AuthChannel) -> Result<Vec<String>, Status> {
-    use v1::server_reflection_request::MessageRequest::ListServices;
-    use v1::server_reflection_response::MessageResponse::ListServicesResponse;
-    let request = v1::ServerReflectionRequest {
-        host: String::new(),
-        message_request: Some(ListServices(String::new())),
-    };
-    let mut client = v1::server_reflection_client::ServerReflectionClient::new(channel.clone());
-    let answers = client.server_reflection_info(tokio_stream::iter([request])).await?;
-    let answer = answers.into_inner().message().await?.expect("an answer");
-    match answer.message_response {
-        Some(ListServicesResponse(listed)) => {
-            Ok(listed.service.into_iter().map(|service| service.name).collect())
+/// Returns the services that a version of reflection lists.
+macro_rules! listed_services {
+    ($version:ident, $channel:expr) => {{
+        use $version::server_reflection_request::MessageRequest::ListServices;
+        use $version::server_reflection_response::MessageResponse::ListServicesResponse;
+        let request = $version::ServerReflectionRequest {
+            host: String::new(),
+            message_request: Some(ListServices(String::new())),
+        };
+        let mut client = $version::server_reflection_client::ServerReflectionClient::new($channel);
+        let answers = client.server_reflection_info(tokio_stream::iter([request])).await?;
+        let answer = answers.into_inner().message().await?.expect("an answer");
+        match answer.message_response {
+            Some(ListServicesResponse(listed)) => {
+                Ok(listed.service.into_iter().map(|service| service.name).collect())
+            }
+            other => Err(Status::internal(format!("not a list of services: {other:?}"))),
         }
-        other => Err(Status::internal(format!("not a list of services: {other:?}"))),
-    }
+    }};
 }
 
-/// Returns the services that reflection lists.
+async fn reflect_v1(channel: &AuthChannel) -> Result<Vec<String>, Status> {
+    listed_services!(v1, channel.clone())
+}
+
 async fn reflect_v1alpha(channel: &AuthChannel) -> Result<Vec<String>, Status> {
-    use v1alpha::server_reflection_request::MessageRequest::ListServices;
-    use v1alpha::server_reflection_response::MessageResponse::ListServicesResponse;
-    let request = v1alpha::ServerReflectionRequest {
-        host: String::new(),
-        message_request: Some(ListServices(String::new())),
-    };
-    let mut client =
-        v1alpha::server_reflection_client::ServerReflectionClient::new(channel.clone());
-    let answers = client.server_reflection_info(tokio_stream::iter([request])).await?;
-    let answer = answers.into_inner().message().await?.expect("an answer");
-    match answer.message_response {
-        Some(ListServicesResponse(listed)) => {
-            Ok(listed.service.into_iter().map(|service| service.name).collect())
-        }
-        other => Err(Status::internal(format!("not a list of services: {other:?}"))),
-    }
+    listed_services!(v1alpha, channel.clone())
 }
 
 #[tokio::test]

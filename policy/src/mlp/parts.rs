@@ -278,7 +278,7 @@ impl Activations {
 pub struct TransposedParameters(AlignedVec);
 
 impl TransposedParameters {
-    /// Transposes the weights in `parameters`, shape `[n_parameters]`.
+    /// Copies `parameters`, shape `[n_parameters]`, and transposes the weights.
     #[must_use]
     pub fn new(shape: &MlpShape, parameters: &[f32]) -> Self {
         let mut transposed = Self(AlignedVec::zeros(shape.n_parameters()));
@@ -286,7 +286,7 @@ impl TransposedParameters {
         transposed
     }
 
-    /// Transposes the weights in `parameters`, shape `[n_parameters]`.
+    /// Copies `parameters`, shape `[n_parameters]`, and transposes the weights.
     pub fn update(&mut self, shape: &MlpShape, parameters: &[f32]) {
         self.blocks(shape).into_iter().for_each(|block| block.update(shape, parameters));
     }
