@@ -228,7 +228,9 @@ class Checked:
                 if way in probe:
                     self.expect(probe[way]["port"] in ports, f"{name}: {kind} asks port {probe[way]['port']}")
             serves = any(port["name"] != "metrics" for port in container.get("ports", []))
-            self.expect(kind == "startupProbe" or not serves or probe, f"{name}: has no {kind}")
+            # No service selects the pods of a job, so nothing asks whether they are ready.
+            is_optional = kind == "startupProbe" or kind == "readinessProbe" and workload["kind"] == "Job"
+            self.expect(is_optional or not serves or probe, f"{name}: has no {kind}")
         scraped = workload["spec"]["template"]["metadata"].get("annotations", {}).get("prometheus.io/port")
         self.expect(scraped is None or int(scraped) in ports, f"{name}: figures are looked for at {scraped}")
         known = set()

@@ -156,6 +156,25 @@ fn health_reports_the_service_and_the_cause_of_a_failure() {
 }
 
 #[test]
+fn a_worker_answers_health_checks_while_it_waits_for_a_learner() {
+    let workspace = Workspace::new();
+    let worker = |listen| ["worker", "--connect", "127.0.0.1:1", "--listen", listen];
+    let mut waiting = workspace.serve("worker", &worker("127.0.0.1:0"));
+    let address = waiting.address.clone();
+    for service in ["", "tandem.v1.Worker"] {
+        let health = workspace.run(&["health", &address, "--service", service]);
+        assert_eq!(String::from_utf8_lossy(&health.stdout), "serving\n", "{}", waiting.log());
+    }
+    let line = fails_with(64, workspace.run(&["status", &address]));
+    assert!(line.contains(&format!("the service at {address} is a worker, not a ")), "{line}");
+    let line = fails_with(75, workspace.run(&worker(&address)));
+    assert!(line.contains(&address) && line.contains("another --listen"), "{line}");
+    let line = fails_with(64, workspace.run(&worker("0.0.0.0:0")));
+    assert!(line.contains("--token-file"), "{line}");
+    assert_eq!(waiting.end(), Some(130), "{}", waiting.log());
+}
+
+#[test]
 fn a_service_that_never_answers_is_unhealthy_after_the_timeout() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = silent.local_addr().expect("bound").to_string();

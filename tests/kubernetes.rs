@@ -88,13 +88,16 @@ fn start(cluster: &mut Cluster, names: &[String]) {
         cluster.start(name);
     }
     // A fast machine would end the run before every pod was seen to be ready.
-    for worker in ["worker-0", "worker-1"] {
+    let (workers, services): (Vec<String>, Vec<String>) =
+        names.iter().cloned().partition(|name| name.starts_with("worker-"));
+    for worker in &workers {
         cluster.signal(worker, "-STOP");
     }
-    cluster.wait_until_ready();
-    for worker in ["worker-0", "worker-1"] {
+    cluster.wait_until_ready(&services);
+    for worker in &workers {
         cluster.signal(worker, "-CONT");
     }
+    cluster.wait_until_ready(&workers);
 }
 
 #[test]
@@ -129,7 +132,7 @@ fn the_manifests_train_to_the_end_while_pods_are_deleted() {
         cluster.start(taken);
     }
     cluster.start("learner-0");
-    cluster.wait_until_ready();
+    cluster.wait_until_ready(&names);
     assert!(cluster.log("learner-0").contains("run resumed"), "{}", cluster.log("learner-0"));
 
     let figures =

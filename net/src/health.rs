@@ -1,4 +1,4 @@
-//! A client for the standard health service (`grpc.health.v1`).
+//! The standard health service (`grpc.health.v1`): a client, and the health of a process that reports its own.
 
 use std::time::Duration;
 
@@ -6,8 +6,36 @@ use tonic::{Code, Status};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
+use tonic_health::server::HealthReporter as Reporter;
 
 use crate::channel::AuthChannel;
+
+/// The name of all services of a server together.
+const WHOLE_SERVER: &str = "";
+
+/// Sets the health of a process that has a [`health_router`](crate::ServerConfig::health_router).
+#[derive(Debug, Clone)]
+pub struct HealthReporter {
+    reporter: Reporter,
+    service: &'static str,
+}
+
+impl HealthReporter {
+    pub(crate) const fn new(reporter: Reporter, service: &'static str) -> Self {
+        Self { reporter, service }
+    }
+
+    /// Sets whether the process is serving, for checks that name its service and for those that name none.
+    pub async fn set_serving(&self, is_serving: bool) {
+        let status = match is_serving {
+            true => tonic_health::ServingStatus::Serving,
+            false => tonic_health::ServingStatus::NotServing,
+        };
+        for service in [WHOLE_SERVER, self.service] {
+            self.reporter.set_service_status(service, status).await;
+        }
+    }
+}
 
 /// The result of a health check that did not succeed.
 #[derive(Debug, thiserror::Error)]

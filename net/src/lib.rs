@@ -46,7 +46,7 @@ pub use channel::{AuthChannel, NOTHING_LISTENS};
 pub use client::{ClientConfig, ClientConfigError};
 pub use connection::{ConnectInfo, Connection, ConnectionClosed, MarkRequest, MarkRequestLayer};
 pub use encoded_response::EncodedResponse;
-pub use health::{HealthError, check_health};
+pub use health::{HealthError, HealthReporter, check_health};
 pub use incoming::Incoming;
 pub use metrics::Metrics;
 pub use pacing::Pacing;

@@ -12,6 +12,7 @@ use tonic::transport::server::Router as TonicRouter;
 use tonic::transport::{Identity, Server, ServerTlsConfig};
 use tonic::{Request, Status};
 use tonic_health::ServingStatus;
+use tonic_health::server::health_reporter;
 use tower::Service;
 use tower::layer::util::{Identity as NoLayer, Stack};
 use tower::util::MapResponseLayer;
@@ -19,6 +20,7 @@ use tower::util::MapResponseLayer;
 use crate::access::{AccessError, Token, is_exposed};
 use crate::connection::{ConnectInfo, MarkRequestLayer};
 use crate::encoded_response::EncodedService;
+use crate::health::HealthReporter;
 use crate::metrics::{Methods, Metrics, RpcLayer};
 use crate::tls::{self, TlsError};
 use crate::wrong_service::name_service;
@@ -42,10 +44,10 @@ pub enum ServerConfigError {
 }
 
 type NameServiceLayer = MapResponseLayer<fn(http::Response<Body>) -> http::Response<Body>>;
+type Layers = Stack<RpcLayer, Stack<NameServiceLayer, Stack<MarkRequestLayer, NoLayer>>>;
 
 /// A service with its health and reflection services, ready for [`serve`](crate::serve()).
-pub type Router =
-    TonicRouter<Stack<RpcLayer, Stack<NameServiceLayer, Stack<MarkRequestLayer, NoLayer>>>>;
+pub type Router = TonicRouter<Layers>;
 
 /// The configuration of a service: its token, its certificate and its metrics. The default has no token and no
 /// certificate.
@@ -132,16 +134,36 @@ impl ServerConfig {
             + 'static,
         S::Future: Send + 'static,
     {
-        let (reporter, health) = tonic_health::server::health_reporter();
+        let (reporter, health) = health_reporter();
         reporter.set_service_status(S::NAME, ServingStatus::Serving).await;
-        let reflection = || {
-            tonic_reflection::server::Builder::configure()
-                .register_encoded_file_descriptor_set(descriptors)
-                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-                .with_service_name(S::NAME)
-                .with_service_name(tonic_health::pb::health_server::SERVICE_NAME)
-        };
-        let token = TokenInterceptor { token: self.token.clone() };
+        let router = self
+            .layered_server::<S>(descriptors)?
+            .add_service(InterceptedService::new(EncodedService(service), self.interceptor()))
+            .add_service(health);
+        self.with_reflection(router, descriptors, &[S::NAME])
+    }
+
+    /// Returns the router of a process `S` that only calls other services, and what sets its health: health without the
+    /// token check, and both versions of reflection behind it. The process is serving until the reporter says otherwise.
+    ///
+    /// # Errors
+    /// When the certificate cannot be used.
+    pub async fn health_router<S: NamedService>(
+        &self,
+    ) -> Result<(Router, HealthReporter), ServerConfigError> {
+        let (reporter, health) = health_reporter();
+        let reporter = HealthReporter::new(reporter, S::NAME);
+        reporter.set_serving(true).await;
+        let router = self.layered_server::<S>(&[])?.add_service(health);
+        Ok((self.with_reflection(router, &[], &[])?, reporter))
+    }
+
+    /// Returns a server without services, whose layers measure the calls of `descriptors` and name the service `S` to
+    /// callers of others.
+    fn layered_server<S: NamedService>(
+        &self,
+        descriptors: &[u8],
+    ) -> Result<Server<Layers>, ServerConfigError> {
         let methods = Methods::of(&[
             descriptors,
             tonic_health::pb::FILE_DESCRIPTOR_SET,
@@ -152,11 +174,33 @@ impl ServerConfig {
             .server()?
             .layer(MarkRequestLayer)
             .layer(NameServiceLayer::new(name_service::<S>))
-            .layer(RpcLayer { metrics: self.metrics.clone(), methods, token: self.token.clone() })
-            .add_service(InterceptedService::new(EncodedService(service), token.clone()))
-            .add_service(health)
-            .add_service(InterceptedService::new(reflection().build_v1()?, token.clone()))
-            .add_service(InterceptedService::new(reflection().build_v1alpha()?, token)))
+            .layer(RpcLayer { metrics: self.metrics.clone(), methods, token: self.token.clone() }))
+    }
+
+    /// Adds both versions of reflection, which list `services` and health.
+    fn with_reflection(
+        &self,
+        router: Router,
+        descriptors: &[u8],
+        services: &[&str],
+    ) -> Result<Router, ServerConfigError> {
+        let reflection = || {
+            let builder = tonic_reflection::server::Builder::configure()
+                .register_encoded_file_descriptor_set(descriptors)
+                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+                .with_service_name(tonic_health::pb::health_server::SERVICE_NAME);
+            services.iter().fold(builder, |builder, &service| builder.with_service_name(service))
+        };
+        Ok(router
+            .add_service(InterceptedService::new(reflection().build_v1()?, self.interceptor()))
+            .add_service(InterceptedService::new(
+                reflection().build_v1alpha()?,
+                self.interceptor(),
+            )))
+    }
+
+    fn interceptor(&self) -> TokenInterceptor {
+        TokenInterceptor { token: self.token.clone() }
     }
 
     fn server(&self) -> Result<Server, ServerConfigError> {

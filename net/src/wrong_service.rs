@@ -13,7 +13,7 @@ const ADDRESS: &str = "tandem-address";
 /// The service that has answered a call meant for a service of another kind.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WrongService {
-    /// The service in lower case: `teacher`, `learner`, `bridge`, `environment` or `policy`.
+    /// The service in lower case: `teacher`, `learner`, `worker`, `bridge`, `environment` or `policy`.
     pub name: String,
     /// The address as the caller gave it.
     pub address: String,

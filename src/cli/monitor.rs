@@ -20,8 +20,8 @@ pub(crate) struct HealthArgs {
     /// Address of the service.
     #[arg(value_name = "ADDR")]
     pub(crate) address: String,
-    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner, tandem.v1.Environment or tandem.v1.Bridge
-    /// [default: the whole server].
+    /// Name of one service: tandem.v1.Teacher, tandem.v1.Learner, tandem.v1.Worker, tandem.v1.Environment or
+    /// tandem.v1.Bridge [default: the whole server].
     #[arg(long, default_value = "", hide_default_value = true, value_name = "NAME")]
     pub(crate) service: String,
     /// Timeout in seconds.

@@ -41,6 +41,13 @@ pub(crate) struct ListenArgs {
     pub(crate) exit_with_stdin: bool,
 }
 
+impl ListenArgs {
+    /// Returns the options of a service at `address` without others.
+    pub(crate) const fn plain(listen: SocketAddr) -> Self {
+        Self { listen, tls_cert: None, tls_key: None, insecure: false, exit_with_stdin: false }
+    }
+}
+
 /// Metrics of a service.
 #[derive(Debug, Args)]
 pub(crate) struct MetricsArgs {
@@ -203,7 +210,9 @@ Examples:
   tandem worker --connect learner:7000 --teacher teacher:7001 \\
       --env simulator:7005
   tandem worker --connect learner:7000 --env-command 'python3 server.py'
-      # a server of its own")]
+      # a server of its own
+  tandem worker --connect learner:7000 --listen 127.0.0.1:7003
+      # for `tandem health 127.0.0.1:7003`")]
 pub(crate) struct WorkerArgs {
     /// Address of the learner or relay.
     #[arg(long, value_name = "ADDR")]
@@ -211,6 +220,10 @@ pub(crate) struct WorkerArgs {
     /// Address of the teacher, if the run uses advice.
     #[arg(long, value_name = "ADDR")]
     pub(crate) teacher: Option<String>,
+    /// Address for health checks; port 0 selects a free port. The address is printed as `listening on ADDR`. The worker is
+    /// serving unless its rollout hangs, which is a step that takes longer than a minute [default: none].
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) listen: Option<SocketAddr>,
     /// Name of the worker in logs and displays.
     #[arg(long, default_value = "worker")]
     pub(crate) name: String,

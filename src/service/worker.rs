@@ -1,16 +1,25 @@
 //! `tandem worker`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
-use tandem_net::Pacing;
-use tandem_worker::{Error, RecordedEpisodes, RecordingConfig, WorkerConfig};
+use tandem_net::{HealthReporter, Metrics, Pacing, ServerConfig};
+use tandem_worker::{Error, Liveness, RecordedEpisodes, RecordingConfig, WorkerConfig};
+use tokio_util::sync::CancellationToken;
+use tonic::server::NamedService;
 use tonic::{Code, Status};
 
-use super::run;
-use crate::cli::{RecordedName, RecordingArgs, WorkerArgs};
+use super::{bind, run};
+use crate::cli::{ListenArgs, RecordedName, RecordingArgs, WorkerArgs};
 use crate::environment_server::EnvironmentSource;
-use crate::exit::{Exit, Failed};
+use crate::exit::{Exit, Failed, OrExit as _};
 use crate::{access, metrics, signals};
+
+/// The time that one step of the environments may take before the worker is no longer serving. It takes milliseconds.
+const STEP_LIMIT: Duration = Duration::from_secs(60);
+/// The interval at which the health of a worker is determined.
+const HEALTH_INTERVAL: Duration = Duration::from_secs(1);
 
 pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     if matches!(args.recording.record, RecordedName::All) && args.log_dir.is_none() {
@@ -21,10 +30,18 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
     let own = metrics::of_process("worker");
     let client_config =
         access::client_config(&args.client_config, &args.secret)?.with_metrics(own.clone());
+    let health = match args.listen {
+        Some(address) => Some(HealthServer::new(address, &args, &own)?),
+        None => None,
+    };
     run(async move {
         let shutdown = signals::shutdown_token(args.exit_with_stdin)?;
         metrics::serve(&args.metrics, &own).await?;
         let server = EnvironmentSource::of(&args.environment, &client_config)?;
+        let liveness = Liveness::default();
+        if let Some(health) = health {
+            health.start(liveness.clone(), own).await?;
+        }
         let config = WorkerConfig {
             client: client_config,
             environment: server.config(),
@@ -33,6 +50,7 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             name: args.name,
             recording: recording(&args.recording, args.log_dir),
             pacing: Pacing::Concurrent,
+            liveness,
         };
         let ended = tandem_worker::run(config, shutdown.clone()).await;
         server.end().await;
@@ -43,6 +61,66 @@ pub(crate) fn worker(args: WorkerArgs) -> Result<(), Failed> {
             false => Ok(()),
         }
     })
+}
+
+/// The name of the worker in health checks.
+struct WorkerService;
+
+impl NamedService for WorkerService {
+    const NAME: &'static str = "tandem.v1.Worker";
+}
+
+/// The server of a worker's health.
+struct HealthServer {
+    listen: ListenArgs,
+    config: ServerConfig,
+}
+
+impl HealthServer {
+    /// Prepares a server at `address`, with the worker's token.
+    fn new(address: SocketAddr, args: &WorkerArgs, metrics: &Metrics) -> Result<Self, Failed> {
+        let listen = ListenArgs::plain(address);
+        let config = access::server_config(&listen, &args.secret)?.with_metrics(metrics.clone());
+        Ok(Self { listen, config })
+    }
+
+    /// Binds the address, prints it, and serves until the process ends.
+    async fn start(self, liveness: Liveness, metrics: Metrics) -> Result<(), Failed> {
+        let bound = bind(&self.listen).await?;
+        let router = self.config.health_router::<WorkerService>().await;
+        let (router, health) = router.or_exit(Exit::Bug, String::new)?;
+        let incoming = bound.announce("");
+        tokio::spawn(async move {
+            let served = tandem_net::serve(router, incoming, CancellationToken::new()).await;
+            if let Err(error) = served {
+                let error = anyhow::Error::from(error);
+                tracing::warn!("health checks are no longer answered: {error:#}");
+            }
+        });
+        tokio::spawn(report_health(health, liveness, metrics));
+        Ok(())
+    }
+}
+
+/// Sets the health by the progress of rollouts, forever.
+async fn report_health(health: HealthReporter, liveness: Liveness, metrics: Metrics) {
+    let mut was_alive = true;
+    loop {
+        tokio::time::sleep(HEALTH_INTERVAL).await;
+        let since = liveness.computing_since();
+        let is_alive = since.is_none_or(|since| metrics.now().saturating_sub(since) < STEP_LIMIT);
+        if is_alive != was_alive {
+            was_alive = is_alive;
+            match is_alive {
+                true => tracing::info!("the rollout goes on: serving again"),
+                false => tracing::error!(
+                    limit_s = STEP_LIMIT.as_secs(),
+                    "the rollout hangs in one step: no longer serving"
+                ),
+            }
+            health.set_serving(is_alive).await;
+        }
+    }
 }
 
 /// Returns the recording of episodes in `directory`.

@@ -78,28 +78,29 @@ impl Cluster {
         self.pods[idx].process = Some(command.spawn().expect("starts"));
     }
 
-    /// Waits until every probe of every pod succeeds. Restarts pods that ended because a peer was unavailable.
-    pub(crate) fn wait_until_ready(&mut self) {
-        let names: Vec<String> = self.pods.iter().map(|pod| pod.name.clone()).collect();
+    /// Waits until every probe of each of these pods succeeds or the pod is complete. Restarts pods that ended because a
+    /// peer was unavailable.
+    pub(crate) fn wait_until_ready(&mut self, names: &[String]) {
         for name in names {
             let ready = (0..DEADLINE.as_millis() / PAUSE.as_millis()).any(|_| {
                 std::thread::sleep(PAUSE);
-                self.restart_if_needed(&name);
-                self.is_healthy(self.pod(&name))
+                self.restart_if_needed(name) || self.is_healthy(self.pod(name))
             });
-            assert!(ready, "{name} did not become ready: {}", self.log(&name));
+            assert!(ready, "{name} did not become ready: {}", self.log(name));
         }
     }
 
-    /// Restarts a pod that ended because a peer was unavailable. A pod that completed stays ended.
-    fn restart_if_needed(&mut self, name: &str) {
+    /// Restarts a pod that ended because a peer was unavailable. Returns true if the pod is complete: it stays ended.
+    fn restart_if_needed(&mut self, name: &str) -> bool {
         let idx = self.index(name);
         let process = self.pods[idx].process.as_mut().expect("the pod was started");
         match process.try_wait().expect("ours").map(|status| status.code()) {
-            None | Some(Some(0)) => {}
+            None => {}
+            Some(Some(0)) => return true,
             Some(Some(TRY_AGAIN)) => self.start(name),
             Some(code) => panic!("{name} ended with {code:?}: {}", self.log(name)),
         }
+        false
     }
 
     pub(crate) fn is_healthy(&self, pod: &Pod) -> bool {

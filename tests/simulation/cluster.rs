@@ -18,7 +18,7 @@ use tandem_rl::RunConfig;
 use tandem_teacher::policy::OneArmPolicy;
 use tandem_teacher::{Advisor, serve_advisor};
 use tandem_telemetry::MetricsLog;
-use tandem_worker::{WorkerConfig, run};
+use tandem_worker::{Liveness, WorkerConfig, run};
 use tokio_util::sync::CancellationToken;
 
 use crate::ledgers::{Ledgers, ObservedLedger, SharedRecord};
@@ -247,6 +247,7 @@ impl PersistentState {
             name: host.to_owned(),
             recording: None,
             pacing: Pacing::Lockstep,
+            liveness: Liveness::default(),
         };
         if let Err(error) = run(config, self.tracker.shutdown_token(host)).await {
             self.tracker.report_violation(with_causes(host, &error));

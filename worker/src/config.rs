@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use tandem_net::{Backoff, ClientConfig, Pacing};
 
+use crate::liveness::Liveness;
+
 /// The configuration of a worker.
 #[derive(Debug, Clone)]
 pub struct WorkerConfig {
@@ -25,6 +27,8 @@ pub struct WorkerConfig {
     pub recording: Option<RecordingConfig>,
     /// The scheduling of sockets and rollouts.
     pub pacing: Pacing,
+    /// Shows whether the worker's rollouts make progress.
+    pub liveness: Liveness,
 }
 
 /// The recording of episodes in a directory.

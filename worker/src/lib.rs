@@ -16,6 +16,7 @@ pub mod explore;
 #[cfg(test)]
 mod fakes;
 mod learner;
+mod liveness;
 mod metrics;
 mod perturbation;
 mod player;
@@ -36,6 +37,7 @@ pub use config::{
 pub use environment::{ServedTask, describe_environments};
 pub use error::Error;
 pub use evaluate::{ComposedTeachers, Evaluation, evaluate_served};
+pub use liveness::Liveness;
 pub use perturbation::{Perturbation, PerturbedActor};
 pub use ports::{Act, Advisor};
 pub use run::{run, run_with};

@@ -8,9 +8,10 @@ use tandem_core::{Contacts, Episode, StepAdvice, StepQuery};
 use tandem_net::Metrics;
 use tandem_net::metrics::{Counter, DURATION_BUCKETS_S, Gauge, Histogram, LATENCY_BUCKETS_S};
 
+use crate::liveness::Liveness;
 use crate::ports::{Advisor, AdvisorGone, EnvironmentError, VectorEnv};
 
-/// The metrics of slots.
+/// The metrics of slots, and the liveness of the rollout that plays them.
 #[derive(Debug, Clone)]
 pub(crate) struct WorkerMetrics {
     metrics: Metrics,
@@ -22,11 +23,12 @@ pub(crate) struct WorkerMetrics {
     episodes: Counter,
     env_steps: Counter,
     parameter_version: Gauge,
+    liveness: Liveness,
 }
 
 impl WorkerMetrics {
     /// Registers the metrics.
-    pub(crate) fn register(metrics: &Metrics) -> Self {
+    pub(crate) fn register(metrics: &Metrics, liveness: Liveness) -> Self {
         let histogram = |name, help, buckets: &[f64]| metrics.histogram(name, help, buckets);
         let wait = "Time for which the worker waited for a slot";
         let slot = "Time in which a slot was played";
@@ -43,6 +45,7 @@ impl WorkerMetrics {
             env_steps: metrics.counter("worker_env_steps", "Steps of environments"),
             parameter_version: metrics.gauge("worker_parameter_version", version),
             metrics: metrics.clone(),
+            liveness,
         }
     }
 
@@ -54,6 +57,22 @@ impl WorkerMetrics {
     pub(crate) fn record_wait(&self, start: Duration, parameter_version: u64) {
         self.metrics.observe_since(&self.wait_seconds, start);
         self.parameter_version.set(i64::try_from(parameter_version).unwrap_or(i64::MAX));
+    }
+
+    /// Calls `play`, which computes except while it [waits](Self::waiting).
+    pub(crate) fn computing<T>(&self, play: impl FnOnce() -> T) -> T {
+        self.liveness.compute(self.now());
+        let played = play();
+        self.liveness.rest();
+        played
+    }
+
+    /// Calls `wait`, which waits for a peer.
+    pub(crate) fn waiting<T>(&self, wait: impl FnOnce() -> T) -> T {
+        self.liveness.rest();
+        let waited = wait();
+        self.liveness.compute(self.now());
+        waited
     }
 
     /// Records a slot that was begun at `start`.
@@ -91,6 +110,7 @@ impl<E: VectorEnv> VectorEnv for Measured<'_, &mut E> {
         let start = self.metrics.now();
         let stepped = self.port.step(actions, observations, contacts);
         self.metrics.metrics.observe_since(&self.metrics.step_seconds, start);
+        self.metrics.liveness.compute(self.metrics.now());
         stepped
     }
 
@@ -118,18 +138,60 @@ impl<A: Advisor> Advisor for Measured<'_, &mut A> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
     use tandem_core::{EpisodeKind, Layout, Task, WorldSettings};
     use tandem_sim::{Env, WorldConfig};
 
     use super::*;
+    use crate::fakes::{FakeEnvironment, LAYOUT};
+    use crate::player::{AdviceReply, PeerChannel, PeerRequest};
     use crate::ports::Simulator;
+
+    #[test]
+    fn a_rollout_computes_from_step_to_step_except_while_it_waits_for_the_teacher() {
+        let seconds = Arc::new(AtomicU64::new(3));
+        let clock = seconds.clone();
+        let now = move || Duration::from_secs(clock.load(Ordering::SeqCst));
+        let liveness = Liveness::default();
+        let metrics = WorkerMetrics::register(&Metrics::new(Arc::new(now)), liveness.clone());
+        let since = || liveness.computing_since().map(|since| since.as_secs());
+        assert_eq!(since(), None);
+
+        let (peers, mut requests) = PeerChannel::new();
+        let mut peers = peers.with_metrics(metrics.clone());
+        let during_advice = liveness.clone();
+        let answering = std::thread::spawn(move || {
+            let asked = requests.blocking_recv();
+            let Some(PeerRequest::Advice(_, response)) = asked else { panic!("{asked:?}") };
+            assert_eq!(during_advice.computing_since(), None);
+            response.send(AdviceReply { steps: Vec::new(), budget_left: 0 }).expect("waits");
+        });
+        metrics.computing(|| {
+            assert_eq!(since(), Some(3));
+            seconds.store(5, Ordering::SeqCst);
+            assert_eq!(since(), Some(3));
+            peers.advise(Vec::new()).expect("answered");
+            assert_eq!(since(), Some(5));
+            seconds.store(8, Ordering::SeqCst);
+            let mut port = FakeEnvironment::new();
+            let mut measured = Measured { port: &mut port, metrics: &metrics };
+            let mut observations = vec![0.0; LAYOUT.n_observation()];
+            let actions = vec![0.0; LAYOUT.n_action()];
+            measured.step(&actions, &mut observations, &mut []).expect("stepped");
+            assert_eq!(since(), Some(8));
+        });
+        assert_eq!(since(), None);
+        answering.join().expect("no panic");
+    }
 
     #[test]
     fn a_measured_simulator_has_the_scenes_of_the_simulator() {
         let layout = Layout::new(Task::Push, 2);
         let env = Env::new(layout, &WorldConfig::default()).unwrap();
         let mut simulator = Simulator::new(env);
-        let metrics = WorkerMetrics::register(&Metrics::default());
+        let metrics = WorkerMetrics::register(&Metrics::default(), Liveness::default());
         let mut measured = Measured { port: &mut simulator, metrics: &metrics };
         let start = EpisodeStart {
             seed: 1,

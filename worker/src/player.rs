@@ -122,6 +122,16 @@ impl Player {
     pub(crate) fn play(
         &mut self,
         order: &SlotOrder,
+        peers: PeerChannel,
+    ) -> Result<PlayedSlot, RolloutError> {
+        let metrics = self.metrics.clone();
+        let peers = peers.with_metrics(metrics.clone());
+        metrics.computing(|| self.play_with(order, peers))
+    }
+
+    fn play_with(
+        &mut self,
+        order: &SlotOrder,
         mut peers: PeerChannel,
     ) -> Result<PlayedSlot, RolloutError> {
         let tracing = self.tracing(order.kind);
@@ -218,19 +228,33 @@ pub(crate) struct PeerChannel {
     requests: mpsc::Sender<PeerRequest>,
     /// Units of the budget that were left after the latest advice.
     budget_left: Option<u64>,
+    /// The metrics that the waiting for responses is reported to, if any.
+    metrics: Option<WorkerMetrics>,
 }
 
 impl PeerChannel {
     pub(crate) fn new() -> (Self, mpsc::Receiver<PeerRequest>) {
         let (sender, receiver) = mpsc::channel(1);
-        (Self { requests: sender, budget_left: None }, receiver)
+        (Self { requests: sender, budget_left: None, metrics: None }, receiver)
+    }
+
+    /// Reports the waiting for responses to `metrics`.
+    pub(crate) fn with_metrics(mut self, metrics: WorkerMetrics) -> Self {
+        self.metrics = Some(metrics);
+        self
     }
 
     /// Sends a request and waits for the response; `None` if the worker is stopping or the peer has failed.
     fn exchange<T>(&self, request: impl FnOnce(oneshot::Sender<T>) -> PeerRequest) -> Option<T> {
         let (sender, response) = oneshot::channel();
-        self.requests.blocking_send(request(sender)).ok()?;
-        response.blocking_recv().ok()
+        let exchange = || {
+            self.requests.blocking_send(request(sender)).ok()?;
+            response.blocking_recv().ok()
+        };
+        match &self.metrics {
+            Some(metrics) => metrics.waiting(exchange),
+            None => exchange(),
+        }
     }
 }
 

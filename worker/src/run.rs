@@ -48,7 +48,7 @@ pub async fn run_with(
     let (learner, teacher) =
         (LearnerClient::new(&config, timeouts)?, TeacherClient::new(&config, timeouts)?);
     let pacing = config.pacing;
-    let metrics = WorkerMetrics::register(config.client.metrics());
+    let metrics = WorkerMetrics::register(config.client.metrics(), config.liveness.clone());
     let environments = config.environment.clone().map(EnvironmentClient::new);
     let mut worker = Worker {
         config,

@@ -7,15 +7,19 @@ use std::time::Duration;
 
 use support::{Authority, Identity, OTHER, SECRET, Served, token};
 use tandem_net::{
-    AuthChannel, ClientConfig, Connection, HealthError, Incoming, ServerConfig, check_health,
+    AuthChannel, ClientConfig, Connection, HealthError, Incoming, ServerConfig, WrongService,
+    check_health,
 };
 use tandem_proto::pb;
 use tandem_proto::pb::bridge_client::BridgeClient;
 use tandem_proto::pb::learner_client::LearnerClient;
 use tandem_proto::pb::teacher_client::TeacherClient;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::server::NamedService;
 use tonic::{Code, Status};
 use tonic_reflection::pb::{v1, v1alpha};
 
@@ -365,4 +369,40 @@ async fn a_health_check_distinguishes_the_ways_of_not_serving() {
     let channel = ClientConfig::default().channel(&address).expect("an address");
     let error = check_health(channel, "", LONG).await.expect_err("no server");
     assert!(matches!(error, HealthError::Unreachable(_)), "{error}");
+}
+
+/// A process that only calls other services.
+struct Caller;
+
+impl NamedService for Caller {
+    const NAME: &'static str = "tandem.v1.Caller";
+}
+
+#[tokio::test]
+async fn a_process_without_services_reports_its_own_health_without_a_token() {
+    let config = ServerConfig::default().with_token(token(SECRET));
+    let (router, reporter) = config.health_router::<Caller>().await.expect("valid");
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("bound").to_string();
+    let serving = tokio::spawn(tandem_net::serve(router, listener, CancellationToken::new()));
+
+    let open = ClientConfig::default().channel(&address).expect("an address");
+    for is_serving in [true, false, true] {
+        reporter.set_serving(is_serving).await;
+        for service in ["", Caller::NAME] {
+            let health = check_health(open.clone(), service, LONG).await;
+            match is_serving {
+                true => health.expect("serving"),
+                false => assert!(matches!(health, Err(HealthError::NotServing)), "{health:?}"),
+            }
+        }
+    }
+    assert_eq!(reflect_v1(&open).await.expect_err("no token").code(), Code::Unauthenticated);
+    let client = ClientConfig::default().with_token(&token(SECRET));
+    let authenticated = client.channel(&address).expect("an address");
+    assert_eq!(reflect_v1(&authenticated).await.expect("listed"), ["grpc.health.v1.Health"]);
+    let status = describe(&authenticated).await.expect_err("no teacher");
+    let expected = WrongService { name: "caller".to_owned(), address };
+    assert_eq!(WrongService::of(&status), Some(expected), "{status}");
+    serving.abort();
 }

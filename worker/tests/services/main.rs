@@ -13,7 +13,9 @@ use tandem_core::{Episode, EpisodeKind};
 use tandem_net::{Backoff, ClientConfig, Pacing};
 use tandem_policy::{Actor, actor_digest, symmetrized_actor};
 use tandem_telemetry::read_episode;
-use tandem_worker::{Error, RecordedEpisodes, RecordingConfig, Timeouts, WorkerConfig, run_with};
+use tandem_worker::{
+    Error, Liveness, RecordedEpisodes, RecordingConfig, Timeouts, WorkerConfig, run_with,
+};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -41,6 +43,7 @@ fn config(learner: &Server, teacher: Option<&Server>) -> WorkerConfig {
         name: "test".to_owned(),
         recording: None,
         pacing: Pacing::Concurrent,
+        liveness: Liveness::default(),
     }
 }
 
