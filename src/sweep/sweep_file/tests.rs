@@ -142,7 +142,7 @@ fn every_shipped_sweep_file_is_valid() {
     let expected = [
         ("sweep-carry-bar", 9),
         ("sweep-few-units", 15),
-        ("sweep-paper-batches", 3),
+        ("sweep-paper-batches", 6),
         ("sweep-paper-students", 8),
         ("sweep-paper-teachers", 6),
         ("sweep-recipe", 24),
