@@ -220,8 +220,8 @@ pub(crate) struct WorkerArgs {
     /// Address of the teacher, if the run uses advice.
     #[arg(long, value_name = "ADDR")]
     pub(crate) teacher: Option<String>,
-    /// Address for health checks; port 0 selects a free port. The address is printed as `listening on ADDR`. The worker is
-    /// serving unless its rollout hangs, which is a step that takes longer than a minute [default: none].
+    /// Address for health checks; port 0 selects a free port. The address is printed as `listening on ADDR`. The worker
+    /// stops serving when one step of its rollout takes longer than a minute [default: none].
     #[arg(long, value_name = "ADDR")]
     pub(crate) listen: Option<SocketAddr>,
     /// Name of the worker in logs and displays.

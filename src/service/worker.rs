@@ -102,7 +102,7 @@ impl HealthServer {
     }
 }
 
-/// Sets the health by the progress of rollouts, forever.
+/// Keeps setting the health according to the progress of rollouts.
 async fn report_health(health: HealthReporter, liveness: Liveness, metrics: Metrics) {
     let mut was_alive = true;
     loop {
@@ -112,7 +112,7 @@ async fn report_health(health: HealthReporter, liveness: Liveness, metrics: Metr
         if is_alive != was_alive {
             was_alive = is_alive;
             match is_alive {
-                true => tracing::info!("the rollout goes on: serving again"),
+                true => tracing::info!("the rollout makes progress again: serving"),
                 false => tracing::error!(
                     limit_s = STEP_LIMIT.as_secs(),
                     "the rollout hangs in one step: no longer serving"

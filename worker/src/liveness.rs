@@ -16,7 +16,7 @@ impl Liveness {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Records that the rollout begins to compute at `now`, or goes on after a completed step.
+    /// Records that the rollout starts to compute at `now`, or has completed a step then and starts the next one.
     pub(crate) fn compute(&self, now: Duration) {
         self.set(Some(now));
     }
